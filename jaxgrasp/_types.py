@@ -1,0 +1,50 @@
+"""Array vocabulary, and every tolerance of the library as a function of dtype, in one place."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+__all__ = [
+    "Array",
+    "Bool",
+    "Float",
+    "Int",
+    "gap_floor",
+    "pivot_tolerance",
+    "rank_tolerance",
+    "rounding_constant",
+    "unit_roundoff",
+]
+
+
+def unit_roundoff(dtype) -> float:
+    """Machine epsilon of ``dtype``: 2.2e-16 (float64), 1.2e-7 (float32)."""
+    return float(np.finfo(jnp.dtype(dtype)).eps)
+
+
+def gap_floor(dtype) -> float:
+    """Smallest duality gap that is worth iterating for: about 4e-12 (float64), 2e-5 (float32).
+
+    Tighter requests are served as far as this floor; the reported gap stays the measured one.
+    """
+    return 2e4 * unit_roundoff(dtype) if jnp.dtype(dtype).itemsize == 8 else 160 * unit_roundoff(dtype)
+
+
+def rank_tolerance(dtype) -> float:
+    """A singular value at or below this times the largest one counts as zero: 64 eps."""
+    return 64 * unit_roundoff(dtype)
+
+
+def pivot_tolerance(dtype) -> float:
+    """A Cholesky pivot at or below this times its own diagonal entry is rounding, not information."""
+    return 32 * unit_roundoff(dtype)
+
+
+def rounding_constant() -> float:
+    """The small constant c in the solver's ``c * eps * |A| * |s|``.
+
+    Twice the checker's, so that what the solver certifies the checker accepts.
+    """
+    return 32.0

@@ -1,0 +1,231 @@
+"""A grasp: contacts on a rigid body, its grasp map G, rank, null space and internal forces.
+
+The body frame sits at the centre of mass. Contact i has position p_i (m), inward unit normal n_i and
+tangents with t_1 x t_2 = n. A wrench is (force in N; torque about the centre of mass in N m), m = 6 entries in
+space and 3 in the plane; a twist is (velocity in m/s; angular velocity in rad/s).
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from ._types import Array, Bool, Float, rank_tolerance
+from .contacts import Component, ContactModel
+from .geometry import contact_frame, cross, normalize, wrench_dimension
+
+__all__ = [
+    "Grasp",
+    "folded_grasp_map",
+    "grasp_map",
+    "grasp_rank",
+    "grasp_singular_values",
+    "internal_force_part",
+    "length_scale",
+    "null_space",
+]
+
+
+def _vectors(value, name: str) -> Array:
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be an array of shape (*batch, k, 3) or (*batch, k, 2)") from error
+    if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
+        raise ValueError(f"{name} must hold real numbers, got dtype {array.dtype}")
+    if array.ndim < 2 or array.shape[-1] not in (2, 3) or array.shape[-2] < 1:
+        raise ValueError(
+            f"{name} must have shape (*batch, k, 3) in space or (*batch, k, 2) in the plane with k >= 1 contacts, "
+            f"got {array.shape}"
+        )
+    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.result_type(float))
+
+
+def _per_contact(value: Array, shape: tuple[int, ...], name: str) -> Array:
+    try:
+        return jnp.broadcast_to(value, shape)
+    except ValueError as error:
+        raise ValueError(
+            f"{name} must be a number or broadcast to one value per contact, shape {shape}, got {value.shape}"
+        ) from error
+
+
+class Grasp(eqx.Module):
+    """Contacts of one grasp, or of a batch of them, on a rigid body.
+
+    position  (*batch, k, 3) or (*batch, k, 2)  contact points relative to the centre of mass, body axes, m
+    normal    the same shape                    inward normals; any length but zero
+    model     a contact model                   coefficients broadcast to one per contact, (*batch, k)
+    active    (*batch, k) bool, optional        False marks padding: that contact does not exist
+
+    Wrong shapes and types raise ValueError; wrong numbers (NaN, zero normal, mu < 0) make the lane INVALID.
+    """
+
+    position: Float[Array, "*batch k d"]
+    normal: Float[Array, "*batch k d"]
+    model: ContactModel
+    active: Bool[Array, "*batch k"]
+
+    def __init__(self, position, normal, model: ContactModel, active=None):
+        position, normal = _vectors(position, "position"), _vectors(normal, "normal")
+        if not isinstance(model, ContactModel):
+            raise ValueError(
+                f"model must be a contact model such as jaxgrasp.HardFinger(friction=0.5), got {model!r}"
+            )
+        if position.shape[-2:] != normal.shape[-2:]:
+            raise ValueError(
+                f"position and normal must agree in contacts and dimension, got {position.shape} and {normal.shape}"
+            )
+        try:
+            shape = jnp.broadcast_shapes(position.shape, normal.shape)
+        except ValueError as error:
+            raise ValueError(
+                f"the batch axes of position {position.shape} and normal {normal.shape} do not broadcast"
+            ) from error
+        model.components(shape[-1])  # a planar soft finger raises here
+        dtype = jnp.result_type(position.dtype, normal.dtype)
+        self.position = jnp.broadcast_to(position.astype(dtype), shape)
+        self.normal = jnp.broadcast_to(normal.astype(dtype), shape)
+        contacts = shape[:-1]
+        self.model = model.with_coefficients(
+            _per_contact(model.friction_coefficient.astype(dtype), contacts, "friction"),
+            _per_contact(model.torsion_coefficient.astype(dtype), contacts, "torsion"),
+        )
+        if active is None:
+            self.active = jnp.ones(contacts, bool)
+        else:
+            mask = jnp.asarray(active)
+            if mask.dtype != jnp.bool_:
+                raise ValueError(f"active must be boolean, one per contact, got dtype {mask.dtype}")
+            self.active = _per_contact(mask, contacts, "active")
+
+    @property
+    def dimension(self) -> int:
+        """2 in the plane, 3 in space."""
+        return self.position.shape[-1]
+
+    @property
+    def contacts(self) -> int:
+        """k, counting padding."""
+        return self.position.shape[-2]
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        return self.position.shape[:-2]
+
+    @property
+    def dtype(self):
+        return self.position.dtype
+
+    def __getitem__(self, index) -> Grasp:
+        """The grasps at ``index`` of the batch."""
+        if not self.batch_shape:
+            raise IndexError("a single grasp has no batch axis to index")
+        return Grasp(
+            self.position[index],
+            self.normal[index],
+            self.model.with_coefficients(
+                self.model.friction_coefficient[index], self.model.torsion_coefficient[index]
+            ),
+            self.active[index],
+        )
+
+
+def contact_wrenches(
+    position: Float[Array, "*batch k d"], normal: Float[Array, "*batch k d"], components: tuple[Component, ...]
+) -> Float[Array, "*batch k m n"]:
+    """``G_i = [t1 t2 n 0; p x t1, p x t2, p x n, n]``, the columns chosen by ``components``.
+
+    ``normal`` must have unit length. Column j is the wrench of a unit force (or torque) along component j.
+    """
+    tangents = contact_frame(normal)
+    direction = {Component.TANGENT_1: tangents[0], Component.TANGENT_2: tangents[-1], Component.NORMAL: normal}
+    columns = []
+    for component in components:
+        if component is Component.SPIN:
+            columns.append(jnp.concatenate([jnp.zeros_like(normal), normal], axis=-1))
+        else:
+            d = direction[component]
+            columns.append(jnp.concatenate([d, cross(position, d)], axis=-1))
+    return jnp.stack(columns, axis=-1)
+
+
+def _stacked(grasp: Grasp, scale: Array | None) -> Array:
+    columns = contact_wrenches(grasp.position, normalize(grasp.normal), grasp.model.components(grasp.dimension))
+    if scale is not None:
+        columns = columns * scale[..., None, :]
+    columns = jnp.where(grasp.active[..., None, None], columns, 0.0)
+    joined = jnp.moveaxis(columns, -3, -2)  # (*batch, m, k, n)
+    return joined.reshape(*joined.shape[:-2], -1)
+
+
+def grasp_map(grasp: Grasp) -> Float[Array, "*batch m kn"]:
+    """``G = [G_1 .. G_k]`` with ``w = G f`` (11.1): contact forces in N (N m) to the wrench they apply.
+
+    Returns (*batch, m, k n); force components in the chapter's order; columns of inactive contacts are zero.
+    """
+    return _stacked(grasp, None)
+
+
+def folded_grasp_map(grasp: Grasp) -> Float[Array, "*batch m kn"]:
+    """``A = G diag(mu, mu, 1, gamma)``: the grasp map on scaled forces s, each contact in |s_t| <= s_n.
+
+    Its range is the span of what the friction cones can do, so its rank is the one that counts.
+    """
+    return _stacked(grasp, grasp.model.scaling(grasp.dimension))
+
+
+def length_scale(grasp: Grasp) -> Float[Array, "*batch"]:
+    """``L = max_i |p_i|`` over the active contacts in m, or 1 where that is zero."""
+    squares = jnp.sum(grasp.position**2, axis=-1)
+    largest = jnp.sqrt(jnp.max(jnp.where(grasp.active, squares, 0.0), axis=-1))
+    return jnp.where(largest > 0, largest, jnp.ones_like(largest))
+
+
+def _per_length(grasp: Grasp, matrix: Array) -> Array:
+    """Divide torque rows by L, so that no rank decision depends on the unit of length."""
+    m = wrench_dimension(grasp.dimension)
+    row = jnp.arange(m) < grasp.dimension
+    return matrix * jnp.where(row, 1.0, 1 / length_scale(grasp)[..., None])[..., None]
+
+
+def grasp_singular_values(grasp: Grasp) -> Float[Array, "*batch m"]:
+    """Singular values of the folded map with lengths divided by L, largest first; no unit."""
+    values = jnp.linalg.svd(_per_length(grasp, folded_grasp_map(grasp)), compute_uv=False)
+    missing = wrench_dimension(grasp.dimension) - values.shape[-1]
+    return jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)])
+
+
+def grasp_rank(grasp: Grasp) -> Float[Array, "*batch"]:
+    """Rank of the folded grasp map: singular values above ``64 eps`` times the largest one."""
+    values = grasp_singular_values(grasp)
+    return jnp.sum(values > rank_tolerance(grasp.dtype) * values[..., :1], axis=-1)
+
+
+def null_space(grasp: Grasp) -> Float[Array, "*batch kn kn"]:
+    """Orthonormal V with ``G V = 0``, basis of the internal forces (11.15), padded with zero columns.
+
+    Only components that exist carry internal force: none at inactive contacts, no tangential one where mu = 0, no
+    spin where gamma = 0. With c such components and r the rank of the folded map, the first c - r columns are the
+    basis (erratum 6: c - m only at full rank); the rest are zero, so the shape does not depend on the numbers.
+    """
+    G = _per_length(grasp, grasp_map(grasp))
+    scale = jnp.where(grasp.active[..., None], grasp.model.scaling(grasp.dimension), 0.0)
+    exists = (scale != 0).reshape(*scale.shape[:-2], -1)
+    # A component that does not exist gets a row of its own, so it drops out of the null space.
+    identity = jnp.eye(G.shape[-1], dtype=G.dtype)
+    system = jnp.concatenate(
+        [jnp.where(exists[..., None, :], G, 0.0), jnp.where(exists[..., None, :], 0.0, identity)], axis=-2
+    )
+    _, values, rows = jnp.linalg.svd(system, full_matrices=False)
+    largest = jnp.maximum(values[..., :1], 1.0)
+    independent = jnp.sum(values > rank_tolerance(grasp.dtype) * largest, axis=-1)
+    basis = jnp.swapaxes(rows[..., ::-1, :], -1, -2)  # null vectors first
+    kept = jnp.arange(G.shape[-1]) < G.shape[-1] - independent[..., None]
+    return jnp.where(kept[..., None, :], basis, 0.0)
+
+
+def internal_force_part(grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch kn"]:
+    """``V V^T f``: the internal (squeeze) part of f in N, the one that applies no net wrench."""
+    V = null_space(grasp)
+    return jnp.einsum("...ij,...kj,...k->...i", V, V, force)

@@ -1,0 +1,284 @@
+"""11.1-11.2: is the grasp wrench resistant (force closure), by how much, and why.
+
+One grasp's way: fold mu and gamma into its grasp map (``margin.fold``); project unit normal forces onto the internal
+forces, which decides many grasps at once and starts the rest (``margin.starting_point``); close the bracket around the
+margin (``solver``); certify (``verdict.judge``). Three sweeps over the tiles: everyone for a few iterations,
+then the stragglers, then the answers; grasps of doubtful rank get their singular values in between.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+
+from ._types import Array, Float, Int, gap_floor, rank_tolerance, rounding_constant, unit_roundoff
+from .cones import cone_max, cone_sum
+from .contacts import Component
+from .grasp import Grasp
+from .lanes import map_selected, map_tiles, tile_width, to_lanes, to_rows
+from .margin import (
+    Contacts,
+    Folded,
+    Projection,
+    fold,
+    margin_program,
+    project,
+    starting_point,
+)
+from .singular import row_svd
+from .solver import ConeProgram, Iterate, Progress, Stop
+from .solver.interior_point import begin, solve
+from .solver.stages import kernel
+from .verdict import Rank, Verdict, judge
+
+__all__ = ["WrenchResistance", "wrench_resistance"]
+
+FIRST_BUDGET = 8  # iterations before stragglers are gathered: most lanes need 6 to 8
+TOTAL_BUDGET = 60
+
+
+class WrenchResistance(eqx.Module):
+    """Verdicts and their proofs, with the batch axes of the grasp in front.
+
+    status          int32, a ``Status``
+    margin, gap     the true margin t* lies in [margin, margin + gap]; t* <= 1, no unit; -inf where no internal
+                    force has a normal component; NaN where INVALID
+    rank            of the folded grasp map, as a float so that INVALID can be NaN
+    internal_force  (*batch, k n) in the chapter's component order, mean normal force 1: the forces behind ``margin``
+                    and the proof of RESISTANT; zero where margin is -inf, NaN where INVALID
+    escape_twist    (*batch, m) (velocity; angular velocity), unit norm: the proof of NOT_RESISTANT; zero where RESISTANT
+    iterations      int32 interior-point iterations spent
+    stop            int32, a ``solver.Stop``: why the iteration ended; ``Stop(code).sentence`` says it in words
+    """
+
+    status: Int[Array, "*batch"]
+    margin: Float[Array, "*batch"]
+    gap: Float[Array, "*batch"]
+    rank: Float[Array, "*batch"]
+    internal_force: Float[Array, "*batch kn"]
+    escape_twist: Float[Array, "*batch m"]
+    iterations: Int[Array, "*batch"]
+    stop: Int[Array, "*batch"]
+
+
+class _State(NamedTuple):
+    """A lane between sweeps, as rows."""
+
+    y: Array
+    u: Array
+    z: Array
+    gap: Array
+    iterations: Array
+    stalled: Array
+    stop: Array
+
+    @classmethod
+    def pack(cls, progress: Progress) -> _State:
+        y, u, z = (to_rows(jnp.stack(part)) for part in progress.iterate)
+        return cls(y, u, z, progress.gap, progress.iterations, progress.stalled, progress.stop)
+
+    def unpack(self) -> Progress:
+        parts = [to_lanes(x) for x in (self.y, self.u, self.z)]
+        iterate = Iterate(*(tuple(x[i] for i in range(x.shape[0])) for x in parts))
+        return Progress(iterate, self.gap, self.iterations, self.stalled, self.stop)
+
+
+class _Plan(NamedTuple):
+    """What is fixed at trace time."""
+
+    components: tuple[Component, ...]
+    dimension: int
+    verdict_only: bool
+    width: int
+
+
+def _decision(folded: Folded, sigma: Array) -> Callable[[ConeProgram, Iterate], Array]:
+    """Whether the bracket already proves a yes or a no with the room for rounding that ``judge`` will ask for."""
+    dtype = folded.norm.dtype
+    unit = rounding_constant() * unit_roundoff(dtype) * folded.norm * folded.count
+    yes = jnp.where(sigma > 0, 8 * unit / jnp.where(sigma > 0, sigma, jnp.ones_like(sigma)), jnp.inf * unit)
+
+    def decided(program: ConeProgram, point: Iterate) -> Array:
+        lower = 1 - program.primal_value(point.u)
+        upper = 1 - program.dual_value(point.y)
+        square = point.y[0] * point.y[0]
+        for v in point.y[1:]:
+            square = square + v * v
+        return (lower > yes) | (upper < -4 * unit * jnp.sqrt(square))
+
+    return decided
+
+
+def _first_sweep(plan: _Plan, tolerance: Array) -> Callable[[Contacts], tuple[_State, Array]]:
+    @kernel
+    def run(contacts: Contacts, tolerance: Array) -> tuple[_State, Array]:
+        folded = fold(contacts, plan.components)
+        projection = project(folded)
+        start = starting_point(folded, projection)
+        program = margin_program(folded)
+        refuted = start.unbounded | (start.escape if plan.verdict_only else jnp.zeros_like(start.escape))
+        zero = tuple(jnp.zeros_like(v) for v in start.iterate.y)
+        dual = tuple(jnp.where(refuted, v, o) for v, o in zip(start.iterate.y, zero, strict=True))
+        state = begin(program, start.iterate._replace(y=dual), ~folded.valid | refuted)
+        if not plan.verdict_only:
+            return _State.pack(solve(program, state, tolerance, FIRST_BUDGET)), projection.sigma
+        # Where full rank is not proven yet, its singular values come first; they may be the answer.
+        decided = _decision(folded, projection.sigma)
+        stop = jnp.where(
+            (state.stop == Stop.RUNNING.value) & decided(program, start.iterate._replace(y=zero)),
+            jnp.int32(Stop.DECIDED.value),
+            state.stop,
+        )
+        waiting = (stop == Stop.RUNNING.value) & (projection.sigma <= 0)
+        state = state._replace(stop=jnp.where(waiting, jnp.int32(Stop.SKIPPED.value), stop))
+        state = solve(program, state, tolerance, FIRST_BUDGET, decided)
+        stop = jnp.where(waiting, jnp.int32(Stop.RUNNING.value), state.stop)
+        return _State.pack(state._replace(stop=stop)), projection.sigma
+
+    return lambda contacts: run(contacts, tolerance)
+
+
+def _straggler_sweep(plan: _Plan, tolerance: Array) -> Callable[[tuple[Contacts, _State, Array]], _State]:
+    @kernel
+    def run(contacts: Contacts, rows: _State, sigma: Array, tolerance: Array) -> _State:
+        folded = fold(contacts, plan.components)
+        program = margin_program(folded)
+        decided = _decision(folded, sigma) if plan.verdict_only else None
+        budget = TOTAL_BUDGET - FIRST_BUDGET
+        return _State.pack(solve(program, rows.unpack(), tolerance, budget, decided))
+
+    return lambda tile: run(*tile, tolerance)
+
+
+class _RankRows(NamedTuple):
+    count: Array
+    smallest: Array
+    null_twist: Array
+
+
+def _rank_sweep(plan: _Plan) -> Callable[[Contacts], _RankRows]:
+    @kernel
+    def run(contacts: Contacts) -> _RankRows:
+        folded = fold(contacts, plan.components)
+        A = jnp.concatenate(folded.columns, axis=1)
+        svd = row_svd(A)
+        smallest, null = svd.smallest()
+        largest = cone_max(svd.values)
+        count = cone_sum((svd.values > rank_tolerance(A.dtype) * largest).astype(A.dtype))
+        return _RankRows(count, smallest, to_rows(null))
+
+    return run
+
+
+def _answer_sweep(plan: _Plan, tolerance: Array) -> Callable[[tuple[Contacts, _State, _RankRows]], Verdict]:
+    @kernel
+    def run(contacts: Contacts, rows: _State, rank_rows: _RankRows, tolerance: Array) -> Verdict:
+        folded = fold(contacts, plan.components)
+        projection: Projection = project(folded)
+        start = starting_point(folded, projection)
+        iterate = rows.unpack().iterate
+        verdict = judge(
+            folded,
+            projection,
+            start,
+            Rank(rank_rows.count, rank_rows.smallest, to_lanes(rank_rows.null_twist)),
+            iterate.u,
+            iterate.y,
+            tolerance,
+            plan.components,
+            to_lanes(contacts.friction),
+            to_lanes(contacts.torsion),
+            plan.dimension,
+        )
+        return verdict._replace(
+            internal_force=to_rows(verdict.internal_force), escape_twist=to_rows(verdict.escape_twist)
+        )
+
+    return lambda tile: run(*tile, tolerance)
+
+
+def _solve_rows(plan: _Plan, contacts: Contacts, tolerance: Array) -> WrenchResistance:
+    """All sweeps over (N, ..) rows."""
+    m = 3 if plan.dimension == 2 else 6
+    n, dtype = contacts.position.shape[0], contacts.position.dtype
+    state, sigma = map_tiles(_first_sweep(plan, tolerance), contacts, plan.width)
+
+    doubtful = sigma <= 0
+    ranks = _RankRows(jnp.full(n, m, dtype), sigma, jnp.zeros((n, m), dtype))
+    ranks = map_selected(_rank_sweep(plan), doubtful, contacts, ranks, plan.width)
+    sigma = jnp.where(doubtful & (ranks.count >= m), ranks.smallest, sigma)
+
+    unfinished = state.stop == Stop.RUNNING.value
+    if plan.verdict_only:
+        unfinished = unfinished & (ranks.count >= m)
+    state = map_selected(_straggler_sweep(plan, tolerance), unfinished, (contacts, state, sigma), state, plan.width)
+    verdict = map_tiles(_answer_sweep(plan, tolerance), (contacts, state, ranks), plan.width)
+    return WrenchResistance(*verdict, iterations=state.iterations, stop=state.stop)
+
+
+@functools.cache
+def _batched(plan: _Plan) -> Callable[..., WrenchResistance]:
+    """The solver with any number of leading batch axes, folded into rows; ``vmap`` only adds another axis."""
+
+    @custom_vmap
+    def run(contacts: Contacts, tolerance: Array) -> WrenchResistance:
+        batch = contacts.active.shape[:-1]
+        rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(batch) :]), contacts)
+        result = _solve_rows(plan, rows, tolerance)
+        return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), result)
+
+    @run.def_vmap
+    def rule(axis_size, in_batched, contacts, tolerance):  # pyright: ignore[reportUnusedFunction]
+        batched, tolerance_batched = in_batched
+        if tolerance_batched:
+            raise ValueError("tolerance must be one number for the whole batch, not one per grasp")
+        full = jax.tree.map(
+            lambda x, b: x if b else jnp.broadcast_to(x[None], (axis_size, *x.shape)), contacts, batched
+        )
+        result = run(full, tolerance)
+        return result, jax.tree.map(lambda _: True, result)
+
+    return run
+
+
+@functools.partial(jax.jit, static_argnames=("plan",))
+def _run(plan: _Plan, contacts: Contacts, tolerance: Array) -> WrenchResistance:
+    return _batched(plan)(contacts, tolerance)
+
+
+def contacts_of(grasp: Grasp) -> Contacts:
+    """The arrays the lanes are made of."""
+    return Contacts(
+        grasp.position, grasp.normal, grasp.model.friction_coefficient, grasp.model.torsion_coefficient, grasp.active
+    )
+
+
+def wrench_resistance(grasp: Grasp, tolerance: float = 1e-8, verdict_only: bool = False) -> WrenchResistance:
+    """Wrench resistance (force closure) of a batch of grasps, with margin and proof (Theorem 1, Prop. 11.2.2).
+
+        t* = max t   subject to   G f = 0,   f_n,i - psi_i(f_i) >= t for all i,   sum_i f_n,i = k
+
+    A grasp is resistant iff its folded grasp map has rank m and t* > 0.
+
+    grasp         a ``Grasp`` with any batch axes; works under ``jax.jit`` and ``jax.vmap``
+    tolerance     width of the bracket [margin, margin + gap] to reach, relative to max(1, |t*|); in float32 about 2e-5 is
+                  the least that can be had. Enable 64-bit JAX (``jax_enable_x64``) for float64.
+    verdict_only  stop each grasp as soon as a certificate exists: faster, with a wider bracket
+
+    Returns a ``WrenchResistance``. Bad numbers make their own lane INVALID; nothing raises inside. Wrong types raise
+    ValueError. Sources: theory of the chapter, Han, Trinkle, Li 2000 (LMI), Boyd, Wegbreit 2007 (certificates).
+    """
+    if not isinstance(grasp, Grasp):
+        raise ValueError(f"wrench_resistance takes a jaxgrasp.Grasp, got {type(grasp).__name__}")
+    if isinstance(tolerance, int | float) and not tolerance > 0:
+        raise ValueError(f"tolerance must be positive, got {tolerance}")
+    plan = _Plan(grasp.model.components(grasp.dimension), grasp.dimension, bool(verdict_only), tile_width())
+    floor = gap_floor(grasp.dtype)
+    goal = jnp.maximum(jnp.asarray(tolerance, grasp.dtype), jnp.asarray(floor, grasp.dtype))
+    return _run(plan, contacts_of(grasp), goal)

@@ -1,0 +1,324 @@
+"""The primal-dual interior-point method on the log-det barrier, one tile of lanes at a time.
+
+Each Newton step follows the central path ``u o z = mu e`` of the barrier problem
+
+    minimise  <c, u> - mu sum_i log det u_i   subject to  B u = b
+
+with Nesterov-Todd scaling W and Mehrotra's predictor and corrector. In scaled coordinates ``q = W dz``,
+``p = W^-1 du`` and ``C = B W`` the linear system collapses to m unknowns:
+
+    (C C^T) dy = r - C h,   q = -C^T dy,   p = h - q.
+
+Sources: Nesterov, Todd 1997; Mehrotra 1992; Vandenberghe 2010. A lane that has finished is frozen whole; a step
+that would lose the interior or the best gap is not taken, so every lane keeps its best iterate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import IntEnum
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+
+from .._types import Array, pivot_tolerance
+from ..cones import (
+    Cone,
+    Scaling,
+    cone_max,
+    cone_sum,
+    determinant,
+    inner,
+    interior_rate,
+    reciprocal_root,
+    scaled_product,
+    tail_inner,
+)
+from .linear import Vector, cholesky, gram, matvec, rmatvec
+from .linear import solve as solve_factored
+from .program import ConeProgram
+from .stages import stage
+
+__all__ = ["Iterate", "Progress", "Step", "Stop", "newton_step", "solve"]
+
+STEP_FRACTION = 0.99  # of the way to the boundary
+STALL_RATIO = 0.9  # a step that leaves more of the gap than this is slow
+PATIENCE = 3  # slow steps in a row before a lane gives up
+
+
+class Stop(IntEnum):
+    """Why a lane stopped; ``Stop(2).sentence`` says it in words."""
+
+    sentence: str
+
+    def __new__(cls, value: int, sentence: str):
+        member = int.__new__(cls, value)
+        member._value_ = value
+        member.sentence = sentence
+        return member
+
+    RUNNING = 0, "The iteration budget ended first; the best iterate is kept."
+    CONVERGED = 1, "The duality gap reached its tolerance."
+    DECIDED = 2, "The question was answered before the gap closed."
+    STALLED = 3, "The gap stopped shrinking: rounding limits this lane; the best iterate is kept."
+    BREAKDOWN = 4, "The next step was not finite or left the cones; the best iterate is kept."
+    SKIPPED = 5, "Nothing to solve: the lane was excluded from the start."
+
+
+class Iterate(NamedTuple):
+    """A strictly interior point: y free (m arrays (L,)), u and z in the cones (d arrays (k, L))."""
+
+    y: Vector
+    u: Cone
+    z: Cone
+
+
+class Step(NamedTuple):
+    """What one Newton step did, per lane."""
+
+    residual: Array  # |b - B u| before the step
+    centering: Array  # sigma
+    primal_length: Array
+    dual_length: Array
+
+
+class Progress(NamedTuple):
+    """The state of a tile between iterations."""
+
+    iterate: Iterate
+    gap: Array  # <u, z>
+    iterations: Array
+    stalled: Array  # consecutive slow steps
+    stop: Array  # Stop, int32
+
+
+@stage
+def _determinant_roots(u: Cone, z: Cone) -> tuple[Array, Array]:
+    return jnp.sqrt(determinant(u)), jnp.sqrt(determinant(z))
+
+
+@stage
+def _scaling_factors(root_u: Array, root_z: Array) -> tuple[Array, Array, Array, Array]:
+    return 1 / root_u, 1 / root_z, jnp.sqrt(root_u / root_z), reciprocal_root(root_u * root_z)
+
+
+@stage
+def _half_angle(u: Cone, z: Cone, inverse_u: Array, inverse_z: Array) -> Array:
+    return reciprocal_root(2 * (1 + inner(u, z) * inverse_u * inverse_z))
+
+
+@stage
+def _scaling_point(u: Cone, z: Cone, inverse_u: Array, inverse_z: Array, half: Array) -> tuple[Cone, Array]:
+    first = (u[0] * inverse_u + z[0] * inverse_z) * half
+    rest = ((a * inverse_u - b * inverse_z) * half for a, b in zip(u[1:], z[1:], strict=True))
+    return (first, *rest), 1 / (1 + first)
+
+
+def nesterov_todd(u: Cone, z: Cone) -> Scaling:
+    """The scaling with ``W z = W^-1 u``."""
+    root_u, root_z = _determinant_roots(u, z)
+    inverse_u, inverse_z, eta, root = _scaling_factors(root_u, root_z)
+    half = _half_angle(u, z, inverse_u, inverse_z)
+    w, inverse = _scaling_point(u, z, inverse_u, inverse_z, half)
+    return Scaling(w, inverse, eta, root)
+
+
+@stage
+def _scale(scaling: Scaling, x: Cone) -> Cone:
+    return scaling.apply(x)
+
+
+@stage
+def _residual(program: ConeProgram, u: Cone) -> Vector:
+    return program.residual(u)
+
+
+@stage
+def _dual_change(columns: Cone, dy: Vector) -> Cone:
+    return tuple(-x for x in rmatvec(columns, dy))
+
+
+@stage
+def _predictor_length(scaling: Scaling, lam: Cone, q: Cone) -> Array:
+    """Step to the boundary along p = -lambda - q, q, capped at 1; the same for both sides."""
+    rho = scaling.to_identity(lam, q)
+    dual, primal = interior_rate(rho), interior_rate(tuple(-x for x in rho)) + 1
+    return 1 / jnp.maximum(jnp.ones_like(dual[0]), cone_max(jnp.maximum(dual, primal)))
+
+
+@stage
+def _centering(exists: Array, lam: Cone, q: Cone, length: Array) -> tuple[Array, Array]:
+    """Mehrotra's sigma = (gap after the predictor / gap)^3, and the target sigma mu."""
+    gap = cone_sum(exists * inner(lam, lam))
+    p_after = tuple((1 - length) * a - length * b for a, b in zip(lam, q, strict=True))
+    q_after = tuple(a + length * b for a, b in zip(lam, q, strict=True))
+    ratio = jnp.clip(cone_sum(exists * inner(p_after, q_after)) / gap, 0, 1)
+    sigma = ratio * ratio * ratio
+    return sigma, sigma * gap / cone_sum(exists)
+
+
+@stage
+def _arrow_head(scaling: Scaling, lam: Cone, q: Cone, target: Array) -> tuple[Array, Array]:
+    """First entry of ``x`` in ``lambda o x = target e + (lambda + q) o q``, and 1 / lambda_0."""
+    moved = tuple(a + b for a, b in zip(lam, q, strict=True))
+    c = scaled_product(moved, q)
+    head = lam[0] * (target + c[0]) - tail_inner(lam, c)
+    return head * scaling.root * scaling.root, 1 / lam[0]
+
+
+@stage
+def _corrected(exists: Array, lam: Cone, q: Cone, head: Array, inverse: Array) -> Cone:
+    """``h = lambda \\ (target e + (lambda + q) o q) - lambda``: centring plus second-order correction."""
+    moved = tuple(a + b for a, b in zip(lam, q, strict=True))
+    c = scaled_product(moved, q)
+    rest = ((b - a * head) * inverse - a for a, b in zip(lam[1:], c[1:], strict=True))
+    return tuple(exists * x for x in (head - lam[0], *rest))
+
+
+@stage
+def _corrector_rhs(residual: Vector, columns: Cone, h: Cone) -> Vector:
+    applied = matvec(columns, h)
+    return tuple(r - applied[i] for i, r in enumerate(residual))
+
+
+@stage
+def _difference(h: Cone, q: Cone) -> Cone:
+    return tuple(a - b for a, b in zip(h, q, strict=True))
+
+
+@stage
+def _step_length(scaling: Scaling, lam: Cone, direction: Cone) -> Array:
+    reach = cone_max(scaling.step_reach(lam, direction)) / STEP_FRACTION
+    return 1 / jnp.maximum(jnp.ones_like(reach), reach)
+
+
+@stage
+def _moved(
+    point: Iterate, columns: Cone, scaling: Scaling, dy: Vector, p: Cone, primal: Array, dual: Array
+) -> Iterate:
+    du, dz = scaling.apply(p), rmatvec(columns, dy)
+    y = tuple(a + dual * b for a, b in zip(point.y, dy, strict=True))
+    u = tuple(a + primal * b for a, b in zip(point.u, du, strict=True))
+    z = tuple(a - dual * b for a, b in zip(point.z, dz, strict=True))
+    return Iterate(y, u, z)
+
+
+def newton_step(program: ConeProgram, point: Iterate) -> tuple[Iterate, Step]:
+    """One predictor-corrector step from a strictly interior point."""
+    dtype = program.exists.dtype
+    residual = _residual(program, point.u)
+    scaling = nesterov_todd(point.u, point.z)
+    lam = _scale(scaling, point.z)
+    scaled = _scale(scaling, program.columns)
+    factor = cholesky(gram(scaled), pivot_tolerance(dtype))
+
+    predictor = solve_factored(factor, program.rhs)
+    q = _dual_change(scaled, predictor)
+    length = _predictor_length(scaling, lam, q)
+    sigma, target = _centering(program.exists, lam, q, length)
+
+    head, inverse = _arrow_head(scaling, lam, q, target)
+    h = _corrected(program.exists, lam, q, head, inverse)
+    dy = solve_factored(factor, _corrector_rhs(residual, scaled, h))
+    q = _dual_change(scaled, dy)
+    p = _difference(h, q)
+
+    primal, dual = _step_length(scaling, lam, p), _step_length(scaling, lam, q)
+    moved = _moved(point, program.columns, scaling, dy, p, primal, dual)
+    squares = residual[0] * residual[0]
+    for r in residual[1:]:
+        squares = squares + r * r
+    return moved, Step(jnp.sqrt(squares), sigma, primal, dual)
+
+
+@stage
+def _gap(exists: Array, point: Iterate) -> tuple[Array, Array]:
+    """``<u, z>`` and whether the point is strictly interior."""
+    gap = cone_sum(exists * inner(point.u, point.z))
+    inside = jnp.isfinite(gap)
+    for x in (point.u, point.z):
+        d = determinant(x)
+        for i in range(d.shape[0]):
+            inside = inside & (d[i] > 0)
+    return gap, inside
+
+
+Decision = Callable[[ConeProgram, Iterate], Array]
+
+
+def advance(program: ConeProgram, state: Progress, tolerance: Array, decided: Decision | None) -> Progress:
+    """One iteration of every lane that is still running."""
+    moved, _ = newton_step(program, state.iterate)
+    gap, inside = _gap(program.exists, moved)
+    return _accept(program, state, moved, gap, inside, tolerance, decided)
+
+
+def _accept(
+    program: ConeProgram,
+    state: Progress,
+    moved: Iterate,
+    gap: Array,
+    inside: Array,
+    tolerance: Array,
+    decided: Decision | None,
+) -> Progress:
+    """Take the step in the lanes it improves; say why the others stop."""
+    running = state.stop == Stop.RUNNING.value
+    taken = running & inside & (gap < state.gap)
+
+    def select(new: Array, old: Array) -> Array:
+        return jnp.where(taken, new, old)
+
+    iterate = Iterate(*(tuple(map(select, new, old)) for new, old in zip(moved, state.iterate, strict=True)))
+    slow = gap > STALL_RATIO * state.gap
+    stalled = jnp.where(taken & slow, state.stalled + 1, jnp.zeros_like(state.stalled))
+
+    def code(stop: Stop, where: Array, otherwise: Array) -> Array:
+        return jnp.where(where, jnp.int32(stop.value), otherwise)
+
+    stop = code(Stop.STALLED, ~taken | (stalled >= PATIENCE), jnp.zeros_like(state.stop))
+    stop = code(Stop.BREAKDOWN, ~inside, stop)
+    if decided is not None:
+        stop = code(Stop.DECIDED, taken & decided(program, iterate), stop)
+    goal = tolerance * jnp.maximum(jnp.ones_like(gap), jnp.abs(program.dual_value(iterate.y)))
+    stop = code(Stop.CONVERGED, taken & (gap <= goal), stop)
+    return Progress(
+        iterate,
+        select(gap, state.gap),
+        jnp.where(running, state.iterations + 1, state.iterations),
+        stalled,
+        jnp.where(running, stop, state.stop),
+    )
+
+
+def begin(program: ConeProgram, point: Iterate, skip: Array) -> Progress:
+    """The state before the first step; lanes in ``skip`` never run."""
+    gap, _ = _gap(program.exists, point)
+    zero = jnp.zeros(gap.shape, jnp.int32)
+    code = jnp.where(skip, jnp.int32(Stop.SKIPPED.value), jnp.int32(Stop.RUNNING.value))
+    return Progress(point, gap, zero, zero, code)
+
+
+def solve(
+    program: ConeProgram,
+    state: Progress,
+    tolerance: Array,
+    budget: int,
+    decided: Decision | None = None,
+) -> Progress:
+    """Iterate until every lane has stopped or ``budget`` more steps are spent.
+
+    tolerance  gap to reach, relative to max(1, |dual value|)
+    decided    optional question ``(program, iterate) -> (L,) bool``: the lane stops as soon as it is answered
+    """
+
+    def unfinished(carry: tuple[Array, Progress]) -> Array:
+        count, progress = carry
+        return (count < budget) & jnp.any(progress.stop == Stop.RUNNING.value)
+
+    def body(carry: tuple[Array, Progress]) -> tuple[Array, Progress]:
+        count, progress = carry
+        return count + 1, advance(program, progress, tolerance, decided)
+
+    return lax.while_loop(unfinished, body, (jnp.int32(0), state))[1]

@@ -1,0 +1,66 @@
+"""Where the compiler must cut: a ``stage`` is computed once and stored, a ``kernel`` becomes one function.
+
+XLA's CPU backend fuses producers into every consumer and recomputes them there; it starts each fusion as a separate
+task of about 0.2 us. For 64 lanes of a few hundred floats both cost more than the arithmetic. Two attributes, which
+JAX lets us put on calls, change that: a call that may not be inlined keeps its results (``stage``), and a "small call" is
+compiled into one function without tasks inside (``kernel``). Measured on one core at k = 4, float64: a
+Newton step costs 0.87 us a lane without, 0.53 with stages, 0.26 with both. A backend that does not know the attributes
+ignores them: the numbers stay right.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax.experimental.xla_metadata import set_xla_metadata
+from jax.interpreters import partial_eval
+
+__all__ = ["kernel", "stage"]
+
+_KEPT = {"inlineable": "false"}
+_SMALL = {"inlineable": "false", "xla_cpu_small_call": "true"}
+
+
+def _called(function: Callable, attributes: dict[str, str]) -> Callable:
+    """``function`` as a call that carries ``attributes``; the operations inside carry none.
+
+    Inputs that nothing reads are dropped: the CPU backend aborts on a small call with an unread parameter.
+    """
+
+    @functools.wraps(function)
+    def wrapper(*args: Any) -> Any:
+        if jax.default_backend() != "cpu":
+            return function(*args)
+        closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
+        live, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
+        inputs = [x for x, keep in zip(jax.tree.leaves(args), used, strict=True) if keep]
+
+        def body(*values: Any) -> Any:
+            return jax.core.eval_jaxpr(live, closed.consts, *values)
+
+        body.__name__ = getattr(function, "__name__", "stage").strip("_")
+        outer = jax.make_jaxpr(jax.jit(body))(*inputs)
+        (call,) = outer.jaxpr.eqns
+        values = dict(zip(outer.jaxpr.invars, inputs, strict=True))
+        values.update(zip(outer.jaxpr.constvars, outer.consts, strict=True))
+        with set_xla_metadata(**attributes):
+            results = call.primitive.bind(*(values[v] for v in call.invars), **call.params)
+        produced = dict(zip(call.outvars, results, strict=True))
+        produced.update(values)
+        flat = [produced[v] for v in outer.jaxpr.outvars]
+        return jax.tree.unflatten(jax.tree.structure(shape), flat)
+
+    return wrapper
+
+
+def stage(function: Callable) -> Callable:
+    """Keep the results of ``function`` instead of recomputing them in every consumer."""
+    return _called(function, _KEPT)
+
+
+def kernel(function: Callable) -> Callable:
+    """Compile ``function``, loops included, into one function of the CPU backend."""
+    return _called(function, _SMALL)

@@ -1,0 +1,31 @@
+"""The one list of answers: an int in arrays and tables, a sentence for people."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+__all__ = ["Status"]
+
+
+class Status(IntEnum):
+    """What a lane of a batch ended with. ``Status(3).sentence`` says it in words.
+
+    The numbers are part of the file format and never change.
+    """
+
+    sentence: str
+
+    def __new__(cls, value: int, sentence: str):
+        member = int.__new__(cls, value)
+        member._value_ = value
+        member.sentence = sentence
+        return member
+
+    RESISTANT = 1, "Wrench resistant (force closure): the internal force proves it."
+    NOT_RESISTANT = 2, "Not wrench resistant: the escape twist is a motion no finger force can oppose."
+    MARGINAL = 3, "Marginal: the margin is zero to within the tolerance, so any disturbance may break the grasp."
+    UNDECIDED = 4, "Undecided: the solver stopped before it had a proof either way."
+    INVALID = 5, (
+        "Invalid: the numbers are not a grasp (NaN or infinite entry, zero-length normal, negative friction, "
+        "or no active contact)."
+    )
