@@ -10,17 +10,16 @@ be drawn at any time, in any order, on any number of threads.
 
 from __future__ import annotations
 
-import threading
-
 import numpy as np
 import trimesh
 
 from .errors import UserError
 from .raycast import RayCaster
 
-__all__ = ["BLOCK", "AntipodalSampler", "SurfaceSampler", "slide_escapes"]
+__all__ = ["BLOCK", "AntipodalSampler", "SurfaceSampler", "geometric_filter", "slide_escapes"]
 
 BLOCK = 4096
+CLOSEST = 1e-3  # m, for the filter
 ROUNDS = 64  # draws of a block's missing pairs before giving up
 
 
@@ -108,7 +107,7 @@ class AntipodalSampler(_Blocks):
 
     friction  mu of the first contact: the ray's angle to the normal is at most atan(mu), uniform over the cone's base
 
-    A ray that leaves through a hole of an open mesh is drawn again; ``missed`` counts them.
+    A ray that leaves through a hole of an open mesh is drawn again.
     """
 
     fingers = 2
@@ -117,27 +116,20 @@ class AntipodalSampler(_Blocks):
         self.surface = SurfaceSampler(mesh, 1, seed)
         self.seed, self.friction = seed, friction
         self.caster = RayCaster(mesh.triangles)
-        self.inward = -np.asarray(mesh.face_normals, np.float64)
-        table = np.full((len(self.inward), 3), np.nan)
-        table[self.surface.face] = self.surface.table[:, 9:]
-        self.inward = table
+        self.inward = np.full((len(mesh.faces), 3), np.nan)
+        self.inward[self.surface.face] = self.surface.table[:, 9:]
         self.shortest = 1e-6 * float(np.linalg.norm(mesh.extents))
-        self.missed = 0
-        self._lock = threading.Lock()
 
     def block(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         generator = _generator(self.seed, index)
         position, normal = np.empty((BLOCK, 2, 3)), np.empty((BLOCK, 2, 3))
-        done = missed = 0
+        done = 0
         for _ in range(ROUNDS):
             pair, inward = self._pairs(generator.random((5, BLOCK)))
             take = min(len(pair), BLOCK - done)
             position[done : done + take], normal[done : done + take] = pair[:take], inward[:take]
-            missed += BLOCK - len(pair)
             done += take
             if done == BLOCK:
-                with self._lock:
-                    self.missed += missed
                 return position, normal
         raise UserError(
             "almost no ray into the mesh finds a second contact: the mesh is open or its faces point inwards; "
@@ -174,19 +166,32 @@ def _check(fingers: int, seed: int) -> None:
         raise UserError(f"the seed must not be negative, got {seed}")
 
 
-def slide_escapes(
-    normal: np.ndarray, friction: np.ndarray, active: np.ndarray | None = None
-) -> np.ndarray:
+def geometric_filter(
+    position: np.ndarray, normal: np.ndarray, friction: np.ndarray, active: np.ndarray
+) -> dict[str, np.ndarray]:
+    """For each reason to drop a grasp before solving it, the rows (n,) it concerns; a row has one reason at most."""
+    slide = slide_escapes(normal, friction, active)
+    with np.errstate(invalid="ignore"):
+        apart = np.linalg.norm(position[:, :, None] - position[:, None], axis=-1)
+    pair = np.triu(np.ones(apart.shape[1:], bool), 1) & active[:, :, None] & active[:, None]
+    close = ((apart < CLOSEST) & pair).any(axis=(1, 2)) & ~slide
+    return {
+        "a slide along the mean normal meets no finger, so not resistant": slide,
+        "two contacts closer than 1 mm": close,
+    }
+
+
+def slide_escapes(normal: np.ndarray, friction: np.ndarray, active: np.ndarray) -> np.ndarray:
     """True where a slide along the mean normal d meets no finger: ``n_i . d > mu_i |d - (n_i . d) n_i|`` for all i.
 
-    Such a slide is an escape twist, so these grasps are certainly not resistant. normal (n, k, 3) unit inward,
-    friction (n, k) or a number, active (n, k). A hundredth of the cone is kept in hand for rounding.
+    Such a slide is an escape twist, so these grasps are certainly not resistant. normal (n, k, 3) of any length,
+    friction and active (n, k). A hundredth of the cone is kept in hand for rounding.
     """
-    live = np.ones(normal.shape[:-1], bool) if active is None else active
-    total = np.where(live[..., None], normal, 0.0).sum(axis=-2)
-    size = np.linalg.norm(total, axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        along = np.einsum("nkj,nj->nk", normal, total) / size[:, None]
+        unit = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+        total = np.where(active[..., None], unit, 0.0).sum(axis=-2)
+        direction = total / np.linalg.norm(total, axis=-1, keepdims=True)
+        along = np.einsum("nkj,nj->nk", unit, direction)
         across = np.sqrt(np.maximum(0.0, 1 - along * along))
-        opposed = ~(along > 1.01 * friction * across + 1e-9)
-    return live.any(axis=-1) & ~(opposed & live).any(axis=-1)
+        slips = along > 1.01 * friction * across + 1e-9  # False for NaN: those go to the solver, which says INVALID
+    return active.any(axis=-1) & (slips | ~active).all(axis=-1)

@@ -159,6 +159,7 @@ def _stacked(grasp: Grasp, scale: Array | None) -> Array:
     return joined.reshape(*joined.shape[:-2], -1)
 
 
+@eqx.filter_jit
 def grasp_map(grasp: Grasp) -> Float[Array, "*batch m kn"]:
     """``G = [G_1 .. G_k]`` with ``w = G f`` (11.1): contact forces in N (N m) to the wrench they apply.
 
@@ -167,6 +168,7 @@ def grasp_map(grasp: Grasp) -> Float[Array, "*batch m kn"]:
     return _stacked(grasp, None)
 
 
+@eqx.filter_jit
 def folded_grasp_map(grasp: Grasp) -> Float[Array, "*batch m kn"]:
     """``A = G diag(mu, mu, 1, gamma)``: the grasp map on scaled forces s, each contact in |s_t| <= s_n.
 
@@ -189,6 +191,7 @@ def _per_length(grasp: Grasp, matrix: Array) -> Array:
     return matrix * jnp.where(row, 1.0, 1 / length_scale(grasp)[..., None])[..., None]
 
 
+@eqx.filter_jit
 def grasp_singular_values(grasp: Grasp) -> Float[Array, "*batch m"]:
     """Singular values of the folded map with lengths divided by L, largest first; no unit."""
     values = jnp.linalg.svd(_per_length(grasp, folded_grasp_map(grasp)), compute_uv=False)
@@ -196,12 +199,14 @@ def grasp_singular_values(grasp: Grasp) -> Float[Array, "*batch m"]:
     return jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)])
 
 
+@eqx.filter_jit
 def grasp_rank(grasp: Grasp) -> Float[Array, "*batch"]:
     """Rank of the folded grasp map: singular values above ``64 eps`` times the largest one."""
     values = grasp_singular_values(grasp)
     return jnp.sum(values > rank_tolerance(grasp.dtype) * values[..., :1], axis=-1)
 
 
+@eqx.filter_jit
 def null_space(grasp: Grasp) -> Float[Array, "*batch kn kn"]:
     """Orthonormal V with ``G V = 0``, basis of the internal forces (11.15), padded with zero columns.
 
@@ -225,6 +230,7 @@ def null_space(grasp: Grasp) -> Float[Array, "*batch kn kn"]:
     return jnp.where(kept[..., None, :], basis, 0.0)
 
 
+@eqx.filter_jit
 def internal_force_part(grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch kn"]:
     """``V V^T f``: the internal (squeeze) part of f in N, the one that applies no net wrench."""
     V = null_space(grasp)

@@ -20,13 +20,19 @@ __all__ = ["map_selected", "map_tiles", "to_lanes", "to_rows"]
 
 Rows = TypeVar("Rows")  # a pytree of arrays (N, ..)
 
-CPU_TILE = 64  # lanes whose data fit the first-level cache at k = 4 in float64
+CPU_TILE = 64  # lanes; a tile of data then fits the first-level cache for up to CACHE_FLOATS numbers a lane
+CACHE_FLOATS = 256
 ACCELERATOR_TILE = 16384
 
 
-def tile_width() -> int:
-    """Lanes a tile: cache-sized on the CPU, large on an accelerator."""
-    return CPU_TILE if jax.default_backend() == "cpu" else ACCELERATOR_TILE
+def tile_width(floats: int) -> int:
+    """Lanes a tile, for problems of ``floats`` matrix entries: cache-sized on the CPU, large on an accelerator."""
+    if jax.default_backend() != "cpu":
+        return ACCELERATOR_TILE
+    width = CPU_TILE
+    while width > 8 and floats * width > CACHE_FLOATS * CPU_TILE:
+        width //= 2
+    return width
 
 
 def to_lanes(rows: Array) -> Array:

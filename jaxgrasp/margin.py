@@ -4,9 +4,9 @@
 
 A is the folded grasp map with lengths divided by L. Substituting u = s - t e makes it a cone program
 
-    minimise (1/k) sum_i u_0,i   subject to   B u = -a,  u in K,     a = sum_i A_i e,  B = A - a e^T / k,
+    minimise -1 + (1/k) sum_i u_0,i   subject to   B u = -a,  u in K,     a = sum_i A_i e,  B = A - a e^T / k,
 
-whose optimal value is 1 - t*. The internal force nearest to equal unit normal forces starts it strictly feasible, and
+whose optimal value is -t*. The internal force nearest to equal unit normal forces starts it strictly feasible, and
 lambda = 0 its dual, so the bracket [1 - <c, u>, 1 - <b, y>] around t* holds from the first iteration on.
 """
 
@@ -263,12 +263,12 @@ def _deflated(normal_column: Array, resultant: Vector, share: Array) -> Array:
 
 
 def margin_program(folded: Folded) -> ConeProgram:
-    """The cone program whose optimal value is 1 - t*."""
+    """The cone program whose optimal value is -t*."""
     share = folded.exists / folded.count
     first = _deflated(folded.columns[0], folded.resultant, share)
     cost = (share, *(jnp.zeros_like(share) for _ in folded.columns[1:]))
     rhs = tuple(-r for r in folded.resultant)
-    return ConeProgram((first, *folded.columns[1:]), rhs, cost, folded.exists)
+    return ConeProgram((first, *folded.columns[1:]), rhs, cost, folded.exists, constant=-1.0)
 
 
 @stage

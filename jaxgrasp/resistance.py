@@ -15,17 +15,18 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jax.custom_batching import custom_vmap
 
 from ._types import Array, Float, Int, gap_floor, rank_tolerance, rounding_constant, unit_roundoff
 from .cones import cone_max, cone_sum
 from .contacts import Component
+from .geometry import wrench_dimension
 from .grasp import Grasp
 from .lanes import map_selected, map_tiles, tile_width, to_lanes, to_rows
 from .margin import (
     Contacts,
     Folded,
-    Projection,
     fold,
     margin_program,
     project,
@@ -98,15 +99,20 @@ class _Plan(NamedTuple):
     width: int
 
 
+def _room_for_rounding(folded: Folded, sigma: Array) -> Array:
+    """The margin from which on ``judge`` will certify a yes; infinite where full rank is not proven."""
+    unit = rounding_constant() * unit_roundoff(folded.norm.dtype) * folded.norm * folded.count
+    return jnp.where(sigma > 0, 8 * unit / jnp.where(sigma > 0, sigma, jnp.ones_like(sigma)), jnp.full_like(unit, jnp.inf))
+
+
 def _decision(folded: Folded, sigma: Array) -> Callable[[ConeProgram, Iterate], Array]:
-    """Whether the bracket already proves a yes or a no with the room for rounding that ``judge`` will ask for."""
-    dtype = folded.norm.dtype
-    unit = rounding_constant() * unit_roundoff(dtype) * folded.norm * folded.count
-    yes = jnp.where(sigma > 0, 8 * unit / jnp.where(sigma > 0, sigma, jnp.ones_like(sigma)), jnp.inf * unit)
+    """Whether the bracket proves a yes or a no, with the room for rounding that ``judge`` will ask for."""
+    yes = _room_for_rounding(folded, sigma)
+    unit = rounding_constant() * unit_roundoff(folded.norm.dtype) * folded.norm * folded.count
 
     def decided(program: ConeProgram, point: Iterate) -> Array:
-        lower = 1 - program.primal_value(point.u)
-        upper = 1 - program.dual_value(point.y)
+        lower = -program.primal_value(point.u)
+        upper = -program.dual_value(point.y)
         square = point.y[0] * point.y[0]
         for v in point.y[1:]:
             square = square + v * v
@@ -115,45 +121,42 @@ def _decision(folded: Folded, sigma: Array) -> Callable[[ConeProgram, Iterate], 
     return decided
 
 
-def _first_sweep(plan: _Plan, tolerance: Array) -> Callable[[Contacts], tuple[_State, Array]]:
+class _Setup(NamedTuple):
+    """What the projection of unit forces shows, as rows."""
+
+    state: _State
+    sigma: Array  # proven lower bound of the smallest singular value, or 0
+    unbounded: Array  # t* = -inf
+
+
+def _setup_kernel(plan: _Plan) -> Callable[[Contacts], _Setup]:
     @kernel
-    def run(contacts: Contacts, tolerance: Array) -> tuple[_State, Array]:
+    def run(contacts: Contacts) -> _Setup:
         folded = fold(contacts, plan.components)
         projection = project(folded)
         start = starting_point(folded, projection)
         program = margin_program(folded)
         refuted = start.unbounded | (start.escape if plan.verdict_only else jnp.zeros_like(start.escape))
-        zero = tuple(jnp.zeros_like(v) for v in start.iterate.y)
-        dual = tuple(jnp.where(refuted, v, o) for v, o in zip(start.iterate.y, zero, strict=True))
+        dual = tuple(jnp.where(refuted, v, jnp.zeros_like(v)) for v in start.iterate.y)
         state = begin(program, start.iterate._replace(y=dual), ~folded.valid | refuted)
-        if not plan.verdict_only:
-            return _State.pack(solve(program, state, tolerance, FIRST_BUDGET)), projection.sigma
-        # Where full rank is not proven yet, its singular values come first; they may be the answer.
-        decided = _decision(folded, projection.sigma)
-        stop = jnp.where(
-            (state.stop == Stop.RUNNING.value) & decided(program, start.iterate._replace(y=zero)),
-            jnp.int32(Stop.DECIDED.value),
-            state.stop,
-        )
-        waiting = (stop == Stop.RUNNING.value) & (projection.sigma <= 0)
-        state = state._replace(stop=jnp.where(waiting, jnp.int32(Stop.SKIPPED.value), stop))
-        state = solve(program, state, tolerance, FIRST_BUDGET, decided)
-        stop = jnp.where(waiting, jnp.int32(Stop.RUNNING.value), state.stop)
-        return _State.pack(state._replace(stop=stop)), projection.sigma
+        if plan.verdict_only:
+            proven = start.lower > _room_for_rounding(folded, projection.sigma)
+            stop = jnp.where(proven, jnp.int32(Stop.DECIDED.value), state.stop)
+            state = state._replace(stop=jnp.where(state.stop == Stop.RUNNING.value, stop, state.stop))
+        return _Setup(_State.pack(state), projection.sigma, start.unbounded)
 
-    return lambda contacts: run(contacts, tolerance)
+    return run
 
 
-def _straggler_sweep(plan: _Plan, tolerance: Array) -> Callable[[tuple[Contacts, _State, Array]], _State]:
+def _iterate_kernel(plan: _Plan) -> Callable[..., _State]:
     @kernel
-    def run(contacts: Contacts, rows: _State, sigma: Array, tolerance: Array) -> _State:
+    def run(contacts: Contacts, rows: _State, sigma: Array, budget: Array, tolerance: Array) -> _State:
         folded = fold(contacts, plan.components)
         program = margin_program(folded)
         decided = _decision(folded, sigma) if plan.verdict_only else None
-        budget = TOTAL_BUDGET - FIRST_BUDGET
         return _State.pack(solve(program, rows.unpack(), tolerance, budget, decided))
 
-    return lambda tile: run(*tile, tolerance)
+    return run
 
 
 class _RankRows(NamedTuple):
@@ -162,7 +165,7 @@ class _RankRows(NamedTuple):
     null_twist: Array
 
 
-def _rank_sweep(plan: _Plan) -> Callable[[Contacts], _RankRows]:
+def _rank_kernel(plan: _Plan) -> Callable[[Contacts], _RankRows]:
     @kernel
     def run(contacts: Contacts) -> _RankRows:
         folded = fold(contacts, plan.components)
@@ -176,17 +179,16 @@ def _rank_sweep(plan: _Plan) -> Callable[[Contacts], _RankRows]:
     return run
 
 
-def _answer_sweep(plan: _Plan, tolerance: Array) -> Callable[[tuple[Contacts, _State, _RankRows]], Verdict]:
+def _answer_kernel(plan: _Plan) -> Callable[..., Verdict]:
     @kernel
-    def run(contacts: Contacts, rows: _State, rank_rows: _RankRows, tolerance: Array) -> Verdict:
+    def run(contacts: Contacts, rows: _State, unbounded: Array, rank_rows: _RankRows, tolerance: Array) -> Verdict:
         folded = fold(contacts, plan.components)
-        projection: Projection = project(folded)
-        start = starting_point(folded, projection)
+        projection = project(folded)
         iterate = rows.unpack().iterate
         verdict = judge(
             folded,
             projection,
-            start,
+            unbounded,
             Rank(rank_rows.count, rank_rows.smallest, to_lanes(rank_rows.null_twist)),
             iterate.u,
             iterate.y,
@@ -200,25 +202,35 @@ def _answer_sweep(plan: _Plan, tolerance: Array) -> Callable[[tuple[Contacts, _S
             internal_force=to_rows(verdict.internal_force), escape_twist=to_rows(verdict.escape_twist)
         )
 
-    return lambda tile: run(*tile, tolerance)
+    return run
 
 
 def _solve_rows(plan: _Plan, contacts: Contacts, tolerance: Array) -> WrenchResistance:
     """All sweeps over (N, ..) rows."""
-    m = 3 if plan.dimension == 2 else 6
-    n, dtype = contacts.position.shape[0], contacts.position.dtype
-    state, sigma = map_tiles(_first_sweep(plan, tolerance), contacts, plan.width)
+    m = wrench_dimension(plan.dimension)
+    n, dtype, width = contacts.position.shape[0], contacts.position.dtype, plan.width
+    setup = map_tiles(_setup_kernel(plan), contacts, width)
 
-    doubtful = sigma <= 0
-    ranks = _RankRows(jnp.full(n, m, dtype), sigma, jnp.zeros((n, m), dtype))
-    ranks = map_selected(_rank_sweep(plan), doubtful, contacts, ranks, plan.width)
-    sigma = jnp.where(doubtful & (ranks.count >= m), ranks.smallest, sigma)
+    doubtful = setup.sigma <= 0
+    ranks = _RankRows(jnp.full(n, m, dtype), setup.sigma, jnp.zeros((n, m), dtype))
+    ranks = map_selected(_rank_kernel(plan), doubtful, contacts, ranks, width)
+    full_rank = ranks.count >= m
+    sigma = jnp.where(doubtful & full_rank, ranks.smallest, setup.sigma)
 
-    unfinished = state.stop == Stop.RUNNING.value
-    if plan.verdict_only:
-        unfinished = unfinished & (ranks.count >= m)
-    state = map_selected(_straggler_sweep(plan, tolerance), unfinished, (contacts, state, sigma), state, plan.width)
-    verdict = map_tiles(_answer_sweep(plan, tolerance), (contacts, state, ranks), plan.width)
+    iterate = _iterate_kernel(plan)
+    budgets = jnp.array([FIRST_BUDGET, TOTAL_BUDGET - FIRST_BUDGET], jnp.int32)
+
+    def one_round(i: Array, state: _State) -> _State:
+        # A rank-deficient grasp has its verdict; only its margin is left to find.
+        unfinished = (state.stop == Stop.RUNNING.value) & (full_rank if plan.verdict_only else True)
+        budget = budgets[i]
+        return map_selected(
+            lambda tile: iterate(*tile, budget, tolerance), unfinished, (contacts, state, sigma), state, width
+        )
+
+    state = lax.fori_loop(0, len(budgets), one_round, setup.state)
+    answer = _answer_kernel(plan)
+    verdict = map_tiles(lambda tile: answer(*tile, tolerance), (contacts, state, setup.unbounded, ranks), width)
     return WrenchResistance(*verdict, iterations=state.iterations, stop=state.stop)
 
 
@@ -278,7 +290,9 @@ def wrench_resistance(grasp: Grasp, tolerance: float = 1e-8, verdict_only: bool 
         raise ValueError(f"wrench_resistance takes a jaxgrasp.Grasp, got {type(grasp).__name__}")
     if isinstance(tolerance, int | float) and not tolerance > 0:
         raise ValueError(f"tolerance must be positive, got {tolerance}")
-    plan = _Plan(grasp.model.components(grasp.dimension), grasp.dimension, bool(verdict_only), tile_width())
+    components = grasp.model.components(grasp.dimension)
+    width = tile_width(wrench_dimension(grasp.dimension) * grasp.contacts * len(components))
+    plan = _Plan(components, grasp.dimension, bool(verdict_only), width)
     floor = gap_floor(grasp.dtype)
     goal = jnp.maximum(jnp.asarray(tolerance, grasp.dtype), jnp.asarray(floor, grasp.dtype))
     return _run(plan, contacts_of(grasp), goal)

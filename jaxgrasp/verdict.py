@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from ._types import Array, rank_tolerance, rounding_constant, unit_roundoff
 from .cones import Cone, cone_min, cone_sum, inner, interior_distance
 from .contacts import Component
-from .margin import Folded, Projection, Start, normalized, onto_null_space, smallest_slack, upper_bound
+from .margin import Folded, Projection, normalized, onto_null_space, smallest_slack, upper_bound
 from .solver.linear import Vector, matvec, rmatvec
 from .solver.stages import stage
 from .status import Status
@@ -96,7 +96,7 @@ def _unfold(s: Cone, components: tuple[Component, ...], friction: Array, torsion
 def judge(
     folded: Folded,
     projection: Projection,
-    start: Start,
+    unbounded: Array,
     rank: Rank,
     u: Cone,
     y: Vector,
@@ -149,7 +149,7 @@ def judge(
     status = choose(Status.RESISTANT, resistant, status)
     status = choose(Status.INVALID, ~folded.valid, status)
 
-    none = start.unbounded
+    none = unbounded
     margin = jnp.where(none, -jnp.inf * one, margin)
     gap = jnp.where(none, jnp.zeros_like(gap), gap)
     nan = jnp.nan * one

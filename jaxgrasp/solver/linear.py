@@ -45,14 +45,17 @@ def _scaled(column: Array, factor: Array) -> Array:
     return column * factor
 
 
-def cholesky(M: Array, tolerance: float) -> Cholesky:
-    """Factor ``M`` (m, m, L), positive semidefinite; pivots at or below ``tolerance * M[j, j]`` count as zero."""
+def cholesky(M: tuple[Array, ...], tolerance: float) -> Cholesky:
+    """Factor M, positive semidefinite, given by its lower columns ``M[j]`` of shape (m - j, L).
+
+    Pivots at or below ``tolerance`` times their diagonal entry count as zero.
+    """
     columns: list[Array] = []
     inverse: list[Array] = []
-    for j in range(M.shape[0]):
+    for j, lower in enumerate(M):
         previous = [(columns[q][j - q :], columns[q][j - q]) for q in range(j)]
-        column = _schur_column(M[j:, j], previous)
-        inverse.append(_inverse_pivot(column[0], M[j, j] * jnp.asarray(tolerance, M.dtype)))
+        column = _schur_column(lower, previous) if previous else lower
+        inverse.append(_inverse_pivot(column[0], lower[0] * jnp.asarray(tolerance, lower.dtype)))
         columns.append(_scaled(column, inverse[-1]))
     return Cholesky(tuple(columns), tuple(inverse))
 
@@ -96,17 +99,24 @@ def inverse_frobenius(factor: Cholesky) -> Array:
     return jnp.where(full, total, jnp.full_like(total, jnp.inf))
 
 
-@stage
-def gram(columns: Cone) -> Array:
-    """``B B^T`` (m, m, L) for B given as d arrays (m, k, L)."""
-    k = columns[0].shape[1]
-    total = None
-    for c in columns:
-        for i in range(k):
-            term = c[:, None, i] * c[None, :, i]
-            total = term if total is None else total + term
-    assert total is not None
-    return total
+def gram(columns: Cone) -> tuple[Array, ...]:
+    """Lower columns (m - j, L) of ``B B^T`` for B given as d arrays (m, k, L)."""
+    # One stage a column: the CPU backend would split a larger one over threads, which a kernel may not.
+    return tuple(_gram_column(columns, j) for j in range(columns[0].shape[0]))
+
+
+def _gram_column(columns: Cone, j: int) -> Array:
+    @stage
+    def products(columns: Cone) -> Array:
+        total = None
+        for c in columns:
+            for i in range(c.shape[1]):
+                term = c[j:, i] * c[j, i]
+                total = term if total is None else total + term
+        assert total is not None
+        return total
+
+    return products(columns)
 
 
 def matvec(columns: Cone, x: Cone) -> Array:

@@ -1,7 +1,7 @@
 """The optimisation problem: data, and the residuals that define its solution.
 
-    minimise    <c, u>   subject to   B u = b,  u in K            (primal)
-    maximise    <b, y>   subject to   z = c - B^T y in K          (dual)
+    minimise    c_0 + <c, u>   subject to   B u = b,  u in K            (primal)
+    maximise    c_0 + <b, y>   subject to   z = c - B^T y in K          (dual)
 
 K is a product of k second-order cones of dimension d. A solution makes ``optimality`` vanish.
 """
@@ -24,20 +24,22 @@ class ConeProgram(NamedTuple):
     rhs      m arrays (L,): b
     cost     d arrays (k, L): c
     exists   (k, L) of zeros and ones: cones that are padding take no part
+    constant c_0, a number
     """
 
     columns: Cone
     rhs: tuple[Array, ...]
     cost: Cone
     exists: Array
+    constant: float = 0.0
 
     def primal_value(self, u: Cone) -> Array:
-        """``<c, u>``."""
-        return cone_sum(inner(self.cost, u))
+        """``c_0 + <c, u>``."""
+        return self.constant + cone_sum(inner(self.cost, u))
 
     def dual_value(self, y: tuple[Array, ...]) -> Array:
-        """``<b, y>``."""
-        total = self.rhs[0] * y[0]
+        """``c_0 + <b, y>``."""
+        total = self.constant + self.rhs[0] * y[0]
         for b, v in zip(self.rhs[1:], y[1:], strict=True):
             total = total + b * v
         return total
