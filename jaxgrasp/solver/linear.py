@@ -41,6 +41,14 @@ def _inverse_pivot(pivot: Array, threshold: Array) -> Array:
 
 
 @stage
+def _floor(diagonal: Vector, factor: Array) -> Array:
+    largest = diagonal[0]
+    for d in diagonal[1:]:
+        largest = jnp.maximum(largest, d)
+    return factor * largest
+
+
+@stage
 def _scaled(column: Array, factor: Array) -> Array:
     return column * factor
 
@@ -48,14 +56,17 @@ def _scaled(column: Array, factor: Array) -> Array:
 def cholesky(M: tuple[Array, ...], tolerance: float) -> Cholesky:
     """Factor M, positive semidefinite, given by its lower columns ``M[j]`` of shape (m - j, L).
 
-    Pivots at or below ``tolerance`` times their diagonal entry count as zero.
+    A pivot counts as zero at or below ``tolerance`` times its own diagonal entry (cancellation), or at or below
+    ``(2 tolerance)^2`` times the largest one (a row of B that is rounding as a whole).
     """
+    dtype = M[0].dtype
+    floor = _floor(tuple(column[0] for column in M), jnp.asarray(4 * tolerance * tolerance, dtype))
     columns: list[Array] = []
     inverse: list[Array] = []
     for j, lower in enumerate(M):
         previous = [(columns[q][j - q :], columns[q][j - q]) for q in range(j)]
         column = _schur_column(lower, previous) if previous else lower
-        inverse.append(_inverse_pivot(column[0], lower[0] * jnp.asarray(tolerance, lower.dtype)))
+        inverse.append(_inverse_pivot(column[0], jnp.maximum(lower[0] * jnp.asarray(tolerance, dtype), floor)))
         columns.append(_scaled(column, inverse[-1]))
     return Cholesky(tuple(columns), tuple(inverse))
 
