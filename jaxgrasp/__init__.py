@@ -14,8 +14,21 @@ from .grasp import (
     internal_force_part,
     null_space,
 )
+from .lmi import (
+    FrictionLMI,
+    LMIFeasibility,
+    LMIProblem,
+    LMISolution,
+    friction_lmi,
+    lmi_feasibility,
+    lmi_margin,
+    lmi_minimize,
+    margin_lmi,
+    second_order_cone_lmi,
+)
 from .resistance import WrenchResistance, wrench_resistance
 from .status import Status
+from .tracing import Trace, load_grasp, save_grasp, trace
 
 __version__ = "0.1.0"
 
@@ -32,9 +45,24 @@ __all__ = [
     "grasp_singular_values",
     "null_space",
     "internal_force_part",
-    # 11.2 wrench resistance
+    # 11.2 friction cones as linear matrix inequalities
+    "friction_lmi",
+    "FrictionLMI",
+    "margin_lmi",
+    "lmi_margin",
+    "lmi_minimize",
+    "lmi_feasibility",
+    "second_order_cone_lmi",
+    "LMIProblem",
+    "LMISolution",
+    "LMIFeasibility",
+    # 11.2 wrench resistance (force closure)
     "wrench_resistance",
     "WrenchResistance",
+    "trace",
+    "Trace",
+    "save_grasp",
+    "load_grasp",
     # answers and their proofs
     "Status",
     "check_certificate",

@@ -122,7 +122,8 @@ def check_certificate(grasp, result, tolerance: float = 1e-8) -> np.ndarray:
         by_component = {"f_x": friction, "f_y": friction, "f_n": np.ones_like(friction), "tau_n": torsion}
         scale = np.stack([by_component[c] for c in components], -1)
         s = _scaled_force(np.where(live[..., None], force, 0.0), scale, normal_index)
-        s = s * (live.sum(-1) / np.sum(s[..., 0], -1))[:, None, None]
+        effort = np.sum(s[..., 0], -1)
+        s = s * np.where(effort > 0, live.sum(-1) / effort, np.nan)[:, None, None]
         slack = np.min(np.where(live, s[..., 0] - np.linalg.norm(s[..., 1:], axis=-1), np.inf), -1)
         residual = np.linalg.norm(np.einsum("lij,lj->li", A, s.reshape(len(s), -1)), axis=-1)
         residual = residual + tiny * np.linalg.norm(s.reshape(len(s), -1), axis=-1)

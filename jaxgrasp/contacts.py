@@ -1,6 +1,6 @@
 """Contact models: objects that answer questions about the forces a contact can transmit.
 
-Every model is one unit second-order cone after scaling (theory: mu and gamma fold into the grasp map's columns),
+Every model is one unit second-order cone after scaling (mu and gamma fold into the grasp map's columns),
 
     psi(f) = |(f_x / mu, f_y / mu, tau_n / gamma)| <= f_n,
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from enum import Enum
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -41,7 +42,7 @@ def _parameter(value, name: str) -> Array:
 
 
 class ContactModel(eqx.Module):
-    """The questions a contact answers. Subclasses state their components and coefficients; the rest follows."""
+    """The questions a contact answers. Subclasses state components and coefficients; the rest follows."""
 
     @abstractmethod
     def components(self, dimension: int) -> tuple[Component, ...]:
@@ -74,7 +75,7 @@ class ContactModel(eqx.Module):
         return self.components(dimension).index(Component.NORMAL)
 
     def scaling(self, dimension: int) -> Float[Array, "*contacts n"]:
-        """``(mu, mu, 1, gamma)`` in the order of the components: f_j = scaling_j * s_j with s in the unit cone."""
+        """``(mu, mu, 1, gamma)`` in the order of the components: f_j = scaling_j s_j, s in the unit cone."""
         mu, gamma = self.friction_coefficient, self.torsion_coefficient
         by_component = {
             Component.TANGENT_1: mu,
@@ -84,7 +85,9 @@ class ContactModel(eqx.Module):
         }
         return jnp.stack([by_component[c] for c in self.components(dimension)], axis=-1)
 
-    def friction_function(self, force: Float[Array, "*contacts n"], dimension: int) -> Float[Array, "*contacts"]:
+    def friction_function(
+        self, force: Float[Array, "*contacts n"], dimension: int
+    ) -> Float[Array, "*contacts"]:
         """``psi(f) = |(f_x / mu, f_y / mu, tau_n / gamma)|`` in N; the force is feasible iff psi(f) <= f_n.
 
         Infinite where a component is not zero but its coefficient is.
@@ -95,12 +98,14 @@ class ContactModel(eqx.Module):
         tangential = jnp.delete(ratio, self.normal_index(dimension), axis=-1)
         return jnp.sqrt(jnp.sum(tangential * tangential, axis=-1))
 
-    def feasibility_slack(self, force: Float[Array, "*contacts n"], dimension: int) -> Float[Array, "*contacts"]:
+    def feasibility_slack(
+        self, force: Float[Array, "*contacts n"], dimension: int
+    ) -> Float[Array, "*contacts"]:
         """``f_n - psi(f)`` in N: positive inside the friction cone."""
         return force[..., self.normal_index(dimension)] - self.friction_function(force, dimension)
 
     def dual_slack(self, velocity: Float[Array, "*contacts n"], dimension: int) -> Float[Array, "*contacts"]:
-        """``x_n - |(mu x_x, mu x_y, gamma x_tau)|``: not negative iff no feasible force does negative work on x.
+        """``x_n - |(mu x_x, mu x_y, gamma x_tau)|``: at least 0 iff no feasible force does negative work.
 
         ``velocity`` is ``G_i^T xi``, the contact's velocity in its own frame (m/s, rad/s).
         """
@@ -115,10 +120,14 @@ def _symmetric_unit(size: int, row: int, column: int, dtype) -> Array:
     return unit.at[column, row].set(1.0)
 
 
-def _arrow_matrices(coefficients: list[Array], diagonal: Array, normal_index: int) -> Float[Array, "*contacts n q q"]:
+def _arrow_matrices(
+    coefficients: list[Array], diagonal: Array, normal_index: int
+) -> Float[Array, "*contacts n q q"]:
     """S_j of the arrow matrix ``diagonal * f_n I + sum_j coefficient_j f_j (e_j e_q^T + e_q e_j^T)``."""
     size = len(coefficients) + 1
-    matrices = [c[..., None, None] * _symmetric_unit(size, j, size - 1, c.dtype) for j, c in enumerate(coefficients)]
+    matrices = [
+        c[..., None, None] * _symmetric_unit(size, j, size - 1, c.dtype) for j, c in enumerate(coefficients)
+    ]
     matrices.insert(normal_index, diagonal[..., None, None] * jnp.eye(size, dtype=diagonal.dtype))
     return jnp.stack(matrices, axis=-3)
 
@@ -128,7 +137,7 @@ class Frictionless(ContactModel):
 
     zero: Array
 
-    def __init__(self, zero=0.0):  # zeros in the shape of the contacts
+    def __init__(self, zero: Any = 0.0):  # zeros in the shape of the contacts
         self.zero = _parameter(zero, "the placeholder")
 
     def components(self, dimension: int) -> tuple[Component, ...]:
@@ -157,7 +166,7 @@ class HardFinger(ContactModel):
 
     friction: Array
 
-    def __init__(self, friction=0.5):
+    def __init__(self, friction: Any = 0.5):
         self.friction = _parameter(friction, "friction")
 
     def components(self, dimension: int) -> tuple[Component, ...]:
@@ -197,15 +206,15 @@ class SoftFinger(ContactModel):
     friction: Array
     torsion: Array
 
-    def __init__(self, friction=0.5, torsion=0.01):
+    def __init__(self, friction: Any = 0.5, torsion: Any = 0.01):
         self.friction = _parameter(friction, "friction")
         self.torsion = _parameter(torsion, "torsion")
 
     def components(self, dimension: int) -> tuple[Component, ...]:
         if dimension == 2:
             raise ValueError(
-                "a planar soft finger does not exist: torsion acts about the normal, which lies in the plane. "
-                "Use HardFinger for planar grasps, or 3-D positions."
+                "a planar soft finger does not exist: torsion acts about the normal, which lies in the "
+                "plane. Use HardFinger for planar grasps, or 3-D positions."
             )
         return (Component.TANGENT_1, Component.TANGENT_2, Component.NORMAL, Component.SPIN)
 
@@ -226,6 +235,7 @@ class SoftFinger(ContactModel):
         lambda_min = f_n - psi. A component whose coefficient is 0 does not exist; its S_j is 0.
         """
         inverses = [
-            jnp.where(c > 0, 1 / jnp.where(c > 0, c, 1.0), 0.0) for c in (self.friction, self.friction, self.torsion)
+            jnp.where(c > 0, 1 / jnp.where(c > 0, c, 1.0), 0.0)
+            for c in (self.friction, self.friction, self.torsion)
         ]
         return _arrow_matrices(inverses, jnp.ones_like(self.friction), self.normal_index(dimension))

@@ -1,8 +1,8 @@
 """A grasp: contacts on a rigid body, its grasp map G, rank, null space and internal forces.
 
 The body frame sits at the centre of mass. Contact i has position p_i (m), inward unit normal n_i and
-tangents with t_1 x t_2 = n. A wrench is (force in N; torque about the centre of mass in N m), m = 6 entries in
-space and 3 in the plane; a twist is (velocity in m/s; angular velocity in rad/s).
+tangents with t_1 x t_2 = n. A wrench is (force in N; torque about the centre of mass in N m), m = 6 entries
+in space and 3 in the plane; a twist is (velocity in m/s; angular velocity in rad/s).
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ def _vectors(value, name: str) -> Array:
         raise ValueError(f"{name} must hold real numbers, got dtype {array.dtype}")
     if array.ndim < 2 or array.shape[-1] not in (2, 3) or array.shape[-2] < 1:
         raise ValueError(
-            f"{name} must have shape (*batch, k, 3) in space or (*batch, k, 2) in the plane with k >= 1 contacts, "
-            f"got {array.shape}"
+            f"{name} must have shape (*batch, k, 3) in space or (*batch, k, 2) in the plane with k >= 1 "
+            f"contacts, got {array.shape}"
         )
     return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.result_type(float))
 
@@ -74,7 +74,8 @@ class Grasp(eqx.Module):
             )
         if position.shape[-2:] != normal.shape[-2:]:
             raise ValueError(
-                f"position and normal must agree in contacts and dimension, got {position.shape} and {normal.shape}"
+                "position and normal must agree in contacts and dimension, "
+                f"got {position.shape} and {normal.shape}"
             )
         try:
             shape = jnp.broadcast_shapes(position.shape, normal.shape)
@@ -132,14 +133,20 @@ class Grasp(eqx.Module):
 
 
 def contact_wrenches(
-    position: Float[Array, "*batch k d"], normal: Float[Array, "*batch k d"], components: tuple[Component, ...]
+    position: Float[Array, "*batch k d"],
+    normal: Float[Array, "*batch k d"],
+    components: tuple[Component, ...],
 ) -> Float[Array, "*batch k m n"]:
     """``G_i = [t1 t2 n 0; p x t1, p x t2, p x n, n]``, the columns chosen by ``components``.
 
     ``normal`` must have unit length. Column j is the wrench of a unit force (or torque) along component j.
     """
     tangents = contact_frame(normal)
-    direction = {Component.TANGENT_1: tangents[0], Component.TANGENT_2: tangents[-1], Component.NORMAL: normal}
+    direction = {
+        Component.TANGENT_1: tangents[0],
+        Component.TANGENT_2: tangents[-1],
+        Component.NORMAL: normal,
+    }
     columns = []
     for component in components:
         if component is Component.SPIN:
@@ -151,7 +158,9 @@ def contact_wrenches(
 
 
 def _stacked(grasp: Grasp, scale: Array | None) -> Array:
-    columns = contact_wrenches(grasp.position, normalize(grasp.normal), grasp.model.components(grasp.dimension))
+    columns = contact_wrenches(
+        grasp.position, normalize(grasp.normal), grasp.model.components(grasp.dimension)
+    )
     if scale is not None:
         columns = columns * scale[..., None, :]
     columns = jnp.where(grasp.active[..., None, None], columns, 0.0)
@@ -210,9 +219,10 @@ def grasp_rank(grasp: Grasp) -> Float[Array, "*batch"]:
 def null_space(grasp: Grasp) -> Float[Array, "*batch kn kn"]:
     """Orthonormal V with ``G V = 0``, basis of the internal forces (11.15), padded with zero columns.
 
-    Only components that exist carry internal force: none at inactive contacts, no tangential one where mu = 0, no
-    spin where gamma = 0. With c such components and r the rank of the folded map, the first c - r columns are the
-    basis (erratum 6: c - m only at full rank); the rest are zero, so the shape does not depend on the numbers.
+    Only components that exist carry internal force: none at inactive contacts, no tangential one where mu =
+    0, no spin where gamma = 0. With c such components and r the rank of the folded map, the first c - r
+    columns are the basis (erratum 6: c - m only at full rank); the rest are zero, so the shape does not
+    depend on the numbers.
     """
     G = _per_length(grasp, grasp_map(grasp))
     scale = jnp.where(grasp.active[..., None], grasp.model.scaling(grasp.dimension), 0.0)

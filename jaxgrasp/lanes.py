@@ -16,7 +16,7 @@ from jax import lax
 
 from ._types import Array
 
-__all__ = ["map_selected", "map_tiles", "to_lanes", "to_rows"]
+__all__ = ["map_selected", "map_tiles", "padded_rows", "tile_width", "to_lanes", "to_rows"]
 
 Rows = TypeVar("Rows")  # a pytree of arrays (N, ..)
 
@@ -49,27 +49,44 @@ def _count(rows: Any) -> int:
     return jax.tree.leaves(rows)[0].shape[0]
 
 
-def map_tiles(kernel: Callable[[Any], Any], rows: Rows, width: int) -> Any:
-    """``kernel`` on every tile of ``width`` rows; the last tile is padded with zero rows, which are dropped again."""
+def padded_rows(rows: Rows, width: int) -> Rows:
+    """``rows`` with zero rows appended up to the next multiple of ``width``, at least one tile."""
+    extra = max(1, -(-_count(rows) // width)) * width - _count(rows)
+    return jax.tree.map(lambda x: jnp.pad(x, [(0, extra)] + [(0, 0)] * (x.ndim - 1)), rows)
+
+
+def map_tiles(kernel: Callable[[Any], Any], rows: Rows, count: Array, width: int) -> Any:
+    """``kernel`` on the first ``count`` rows, a tile of ``width`` at a time; zeros for the rows beyond.
+
+    The number of rows is a multiple of ``width``. The cost follows ``count``, not the number of rows.
+    """
     n = _count(rows)
-    tiles = max(1, -(-n // width))
 
-    def split(x: Array) -> Array:
-        padded = jnp.pad(x, [(0, tiles * width - n)] + [(0, 0)] * (x.ndim - 1))
-        return padded.reshape(tiles, width, *x.shape[1:])
+    def tile_at(start: Array) -> Any:
+        return jax.tree.map(lambda x: lax.dynamic_slice_in_dim(x, start, width), rows)
 
-    done = lax.map(kernel, jax.tree.map(split, rows))
-    return jax.tree.map(lambda x: x.reshape(tiles * width, *x.shape[2:])[:n], done)
+    shapes = jax.eval_shape(lambda: kernel(tile_at(jnp.int32(0))))
+    out = jax.tree.map(lambda s: jnp.zeros((n, *s.shape[1:]), s.dtype), shapes)
+
+    def one_tile(carry: tuple[Array, Any]) -> tuple[Array, Any]:
+        start, current = carry
+        result = kernel(tile_at(start))
+        updated = jax.tree.map(
+            lambda x, r: lax.dynamic_update_slice_in_dim(x, r, start, 0), current, result
+        )
+        return start + jnp.int32(width), updated
+
+    return lax.while_loop(lambda carry: carry[0] < count, one_tile, (jnp.int32(0), out))[1]
 
 
 def map_selected(kernel: Callable[[Any], Any], selected: Array, rows: Any, out: Rows, width: int) -> Rows:
     """``out`` with the rows in ``selected`` (N,) replaced by what ``kernel`` makes of ``rows``; others untouched.
 
-    The selected rows are gathered into tiles, so the cost follows their number.
+    The number of rows is a multiple of ``width``. The selected ones are gathered into tiles, so the cost follows their
+    number.
     """
     n = _count(rows)
-    slots = max(1, -(-n // width)) * width
-    index = jnp.nonzero(selected, size=slots, fill_value=n)[0].astype(jnp.int32)
+    index = jnp.nonzero(selected, size=n, fill_value=n)[0].astype(jnp.int32)
     count = jnp.sum(selected, dtype=jnp.int32)
 
     def pending(carry: tuple[Array, Rows]) -> Array:

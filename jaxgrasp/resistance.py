@@ -15,6 +15,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
 
@@ -23,7 +24,7 @@ from .cones import cone_max, cone_sum
 from .contacts import Component
 from .geometry import wrench_dimension
 from .grasp import Grasp
-from .lanes import map_selected, map_tiles, tile_width, to_lanes, to_rows
+from .lanes import map_selected, map_tiles, padded_rows, tile_width, to_lanes, to_rows
 from .margin import (
     Contacts,
     Folded,
@@ -42,6 +43,7 @@ __all__ = ["WrenchResistance", "wrench_resistance"]
 
 FIRST_BUDGET = 8  # iterations before stragglers are gathered: most lanes need 6 to 8
 TOTAL_BUDGET = 60
+CHUNK = 4096  # grasps an executable takes at once when called on concrete arrays
 
 
 class WrenchResistance(eqx.Module):
@@ -205,13 +207,15 @@ def _answer_kernel(plan: _Plan) -> Callable[..., Verdict]:
     return run
 
 
-def _solve_rows(plan: _Plan, contacts: Contacts, tolerance: Array) -> WrenchResistance:
-    """All sweeps over (N, ..) rows."""
+def _solve_rows(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array) -> WrenchResistance:
+    """All sweeps over the first ``count`` of (N, ..) rows; N is a multiple of the tile width."""
     m = wrench_dimension(plan.dimension)
     n, dtype, width = contacts.position.shape[0], contacts.position.dtype, plan.width
-    setup = map_tiles(_setup_kernel(plan), contacts, width)
+    setup = map_tiles(_setup_kernel(plan), contacts, count, width)
 
-    doubtful = setup.sigma <= 0
+    exists = jnp.arange(n, dtype=jnp.int32) < count
+
+    doubtful = exists & (setup.sigma <= 0)
     ranks = _RankRows(jnp.full(n, m, dtype), setup.sigma, jnp.zeros((n, m), dtype))
     ranks = map_selected(_rank_kernel(plan), doubtful, contacts, ranks, width)
     full_rank = ranks.count >= m
@@ -222,7 +226,9 @@ def _solve_rows(plan: _Plan, contacts: Contacts, tolerance: Array) -> WrenchResi
 
     def one_round(i: Array, state: _State) -> _State:
         # A rank-deficient grasp has its verdict; only its margin is left to find.
-        unfinished = (state.stop == Stop.RUNNING.value) & (full_rank if plan.verdict_only else True)
+        unfinished = exists & (state.stop == Stop.RUNNING.value)
+        if plan.verdict_only:
+            unfinished = unfinished & full_rank
         budget = budgets[i]
         return map_selected(
             lambda tile: iterate(*tile, budget, tolerance), unfinished, (contacts, state, sigma), state, width
@@ -230,7 +236,8 @@ def _solve_rows(plan: _Plan, contacts: Contacts, tolerance: Array) -> WrenchResi
 
     state = lax.fori_loop(0, len(budgets), one_round, setup.state)
     answer = _answer_kernel(plan)
-    verdict = map_tiles(lambda tile: answer(*tile, tolerance), (contacts, state, setup.unbounded, ranks), width)
+    rows = (contacts, state, setup.unbounded, ranks)
+    verdict = map_tiles(lambda tile: answer(*tile, tolerance), rows, count, width)
     return WrenchResistance(*verdict, iterations=state.iterations, stop=state.stop)
 
 
@@ -242,8 +249,9 @@ def _batched(plan: _Plan) -> Callable[..., WrenchResistance]:
     def run(contacts: Contacts, tolerance: Array) -> WrenchResistance:
         batch = contacts.active.shape[:-1]
         rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(batch) :]), contacts)
-        result = _solve_rows(plan, rows, tolerance)
-        return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), result)
+        n = rows.active.shape[0]
+        result = _solve_rows(plan, padded_rows(rows, plan.width), jnp.int32(n), tolerance)
+        return jax.tree.map(lambda x: x[:n].reshape(*batch, *x.shape[1:]), result)
 
     @run.def_vmap
     def rule(axis_size, in_batched, contacts, tolerance):  # pyright: ignore[reportUnusedFunction]
@@ -259,9 +267,26 @@ def _batched(plan: _Plan) -> Callable[..., WrenchResistance]:
     return run
 
 
-@functools.partial(jax.jit, static_argnames=("plan",))
-def _run(plan: _Plan, contacts: Contacts, tolerance: Array) -> WrenchResistance:
-    return _batched(plan)(contacts, tolerance)
+_solve_chunk = jax.jit(_solve_rows, static_argnames=("plan",))
+
+
+def _solve_on_host(plan: _Plan, contacts: Contacts, tolerance: Array) -> WrenchResistance:
+    """Chunks of one shape, so that every batch size runs the same executable, compiled once."""
+    batch = contacts.active.shape[:-1]
+    rows = [np.asarray(x).reshape(-1, *x.shape[len(batch) :]) for x in contacts]
+    n = len(rows[0])
+    results = []
+    for start in range(0, max(n, 1), CHUNK):
+        count = min(CHUNK, n - start)
+        chunk = []
+        for x in rows:
+            part = np.zeros((CHUNK, *x.shape[1:]), x.dtype)
+            part[:count] = x[start : start + count]
+            chunk.append(part)
+        result = _solve_chunk(plan, Contacts(*chunk), jnp.int32(count), tolerance)
+        results.append(jax.tree.map(lambda x, c=count: np.asarray(x)[:c], result))
+    joined = jax.tree.map(lambda *parts: np.concatenate(parts) if len(parts) > 1 else parts[0], *results)
+    return jax.tree.map(lambda x: jnp.asarray(x.reshape((*batch, *x.shape[1:]))), joined)
 
 
 def contacts_of(grasp: Grasp) -> Contacts:
@@ -295,4 +320,8 @@ def wrench_resistance(grasp: Grasp, tolerance: float = 1e-8, verdict_only: bool 
     plan = _Plan(components, grasp.dimension, bool(verdict_only), width)
     floor = gap_floor(grasp.dtype)
     goal = jnp.maximum(jnp.asarray(tolerance, grasp.dtype), jnp.asarray(floor, grasp.dtype))
-    return _run(plan, contacts_of(grasp), goal)
+    contacts = contacts_of(grasp)
+    traced = any(isinstance(x, jax.core.Tracer) for x in (*contacts, goal))
+    if traced or jax.default_backend() != "cpu":
+        return _batched(plan)(contacts, goal)
+    return _solve_on_host(plan, contacts, goal)

@@ -1,0 +1,339 @@
+"""Wrench resistance: known answers, bad numbers, bits, transformations."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from families import random_active, random_coefficients, random_contacts
+
+import jaxgrasp as jg
+from jaxgrasp import Status
+from jaxgrasp.solver import Stop
+
+TIGHT = {"float64": 2e-8, "float32": 5e-3}
+F32 = pytest.mark.f32
+
+
+def unit(v):
+    v = np.asarray(v, float)
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def padded(position, normal, k=6):
+    """One grasp padded to k contacts with NaN, which must not matter."""
+    position, normal = np.asarray(position, float), np.asarray(normal, float)
+    fill = np.full((k - len(position), position.shape[1]), np.nan)
+    active = np.arange(k) < len(position)
+    return np.concatenate([position, fill]), np.concatenate([normal, fill]), active
+
+
+def grasp_of(cases, friction, torsion, dtype):
+    position, normal, active = (np.stack(x) for x in zip(*(padded(p, n) for p, n in cases), strict=True))
+    friction = np.broadcast_to(np.asarray(friction, dtype), active.shape)
+    if torsion is None:
+        model = jg.HardFinger(friction)
+    else:
+        model = jg.SoftFinger(friction, np.broadcast_to(np.asarray(torsion, dtype), active.shape))
+    return jg.Grasp(position.astype(dtype), normal.astype(dtype), model, active)
+
+
+TETRAHEDRON = unit([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+EQUATOR = np.array([[np.cos(a), np.sin(a), 0] for a in (0, 2 * np.pi / 3, 4 * np.pi / 3)])
+ANTIPODAL = np.array([[1.0, 0, 0], [-1, 0, 0]])
+
+
+@pytest.fixture(scope="module")
+def known(dtype):
+    """Soft fingers, so that one compiled shape serves every case; gamma = 0 makes a hard finger."""
+    corner = np.array([[-1.0, 0, 0], [0, 0, -1], [0, 0, 1]])
+    tilt = [[0.866, 0.5, 0], [-0.866, 0, 0.5]]
+    cases = [
+        (TETRAHEDRON, -TETRAHEDRON),
+        (EQUATOR, -EQUATOR),
+        (ANTIPODAL, -ANTIPODAL),
+        (ANTIPODAL, -ANTIPODAL),
+        (-ANTIPODAL, tilt),
+        (-ANTIPODAL, tilt),
+        (corner, -corner),
+        (corner, -corner),
+        (EQUATOR, np.tile([0.0, 0, 1], (3, 1)) + 0.05 * EQUATOR),
+        (ANTIPODAL, -ANTIPODAL),
+    ]
+    friction = np.array([[0.01] * 6] + [[0.5] * 6] * 9)
+    friction[6, :3], friction[7, :3] = (0, 1, 1), (1, 1, 1)
+    friction[8] = 0.1
+    friction[9] = 0.0
+    torsion = np.zeros((10, 6))
+    torsion[3], torsion[4], torsion[5], torsion[9] = 0.1, 2.0, 0.01, 0.0
+    grasp = grasp_of(cases, friction, torsion, dtype)
+    return grasp, jg.wrench_resistance(grasp)
+
+
+@F32
+def test_tetrahedron_has_margin_one_at_any_friction(known, dtype):
+    _, res = known
+    assert res.status[0] == Status.RESISTANT
+    assert res.rank[0] == 6
+    np.testing.assert_allclose(res.margin[0], 1.0, atol=TIGHT[dtype])
+
+
+@F32
+def test_three_contacts_on_the_equator_resist(known, dtype):
+    _, res = known
+    assert res.status[1] == Status.RESISTANT
+    assert res.rank[1] == 6
+    np.testing.assert_allclose(res.margin[1], 1.0, atol=TIGHT[dtype])
+
+
+@F32
+def test_two_hard_fingers_leave_the_rotation_about_their_line(known, dtype):
+    _, res = known
+    assert res.status[2] == Status.NOT_RESISTANT
+    assert res.rank[2] == 5
+    np.testing.assert_allclose(res.margin[2], 1.0, atol=TIGHT[dtype])
+    twist = np.asarray(res.escape_twist[2])
+    np.testing.assert_allclose(np.abs(twist), [0, 0, 0, 1, 0, 0], atol=1e-5 if dtype == "float32" else 1e-12)
+
+
+@F32
+def test_two_soft_fingers_resist(known, dtype):
+    _, res = known
+    assert res.status[3] == Status.RESISTANT
+    np.testing.assert_allclose(res.margin[3], 1.0, atol=TIGHT[dtype])
+
+
+@F32
+def test_soft_fingers_outside_nguyens_condition_may_still_resist(known, dtype):
+    """p on the x axis, normals 30 degrees off in different planes, mu = 0.5 < tan 30: gamma decides."""
+    _, res = known
+    np.testing.assert_allclose(np.asarray(res.margin[4:6]), [0.106, -0.155], atol=6e-4 + TIGHT[dtype])
+    assert list(res.status[4:6]) == [Status.RESISTANT, Status.NOT_RESISTANT]
+
+
+@F32
+def test_the_rank_that_counts_is_the_folded_one(known):
+    grasp, res = known
+    assert res.rank[6] == 5
+    assert res.margin[6] > 0.1
+    assert res.status[6] == Status.NOT_RESISTANT
+    assert np.linalg.matrix_rank(np.asarray(jg.grasp_map(grasp))[6]) == 6
+    assert (res.rank[7], res.status[7]) == (6, Status.RESISTANT)
+
+
+@F32
+def test_normals_in_a_half_space_escape_by_a_translation(known):
+    _, res = known
+    assert res.status[8] == Status.NOT_RESISTANT
+    assert res.margin[8] < 0
+    v, w = np.asarray(res.escape_twist[8][:3]), np.asarray(res.escape_twist[8][3:])
+    assert v[2] > 0.9
+    assert np.linalg.norm(w) < 0.35
+
+
+@F32
+def test_frictionless_pair(known):
+    _, res = known
+    assert res.status[9] == Status.NOT_RESISTANT
+    assert res.rank[9] == 1
+
+
+@F32
+def test_every_known_verdict_is_certified(known):
+    grasp, res = known
+    assert jg.check_certificate(grasp, res).all()
+
+
+def test_internal_force_is_internal_and_scaled(known):
+    grasp, res = known
+    yes = np.asarray(res.status) == Status.RESISTANT
+    force = np.asarray(res.internal_force)
+    np.testing.assert_allclose(np.einsum("bij,bj->bi", jg.grasp_map(grasp), force)[yes], 0, atol=1e-12)
+    normal = force.reshape(len(force), -1, 4)[..., 2]
+    np.testing.assert_allclose(normal.sum(-1)[yes], np.asarray(grasp.active).sum(-1)[yes], rtol=1e-12)
+    slack = grasp.model.feasibility_slack(jnp.asarray(force.reshape(len(force), -1, 4)), 3)
+    least = np.where(grasp.active, slack, np.inf).min(-1)
+    np.testing.assert_allclose(np.asarray(res.margin)[yes], least[yes], atol=1e-9)
+
+
+def test_escape_twist_is_opposed_by_no_force(known):
+    grasp, res = known
+    no = np.asarray(res.status) == Status.NOT_RESISTANT
+    twist = np.asarray(res.escape_twist)
+    np.testing.assert_allclose(np.linalg.norm(twist[no], axis=-1), 1, rtol=1e-12)
+    velocity = np.einsum("bij,bi->bj", jg.grasp_map(grasp), twist).reshape(len(twist), -1, 4)
+    slack = np.asarray(grasp.model.dual_slack(jnp.asarray(velocity), 3))
+    assert np.where(grasp.active, slack, 0)[no].min() > -1e-12
+    assert (twist[~no] == 0).all()
+
+
+@pytest.mark.parametrize("angle", [5.0, 20.0, 35.0])
+def test_two_planar_fingers_obey_nguyen(angle):
+    """Critical mu = tan of the largest angle between a normal and the joining line."""
+    a = np.deg2rad(angle)
+    position = np.array([[-1.0, 0], [1, 0]])
+    normal = np.array([[np.cos(a), np.sin(a)], [-1, 0]])
+    factors = np.array([0.5, 0.99, 0.9999, 1.0001, 1.01, 2.0])
+    friction = np.tan(a) * factors[:, None] * np.ones((6, 2))
+    grasp = jg.Grasp(np.tile(position, (6, 1, 1)), np.tile(normal, (6, 1, 1)), jg.HardFinger(friction))
+    res = jg.wrench_resistance(grasp)
+    assert list(res.status) == [Status.NOT_RESISTANT] * 3 + [Status.RESISTANT] * 3
+    assert jg.check_certificate(grasp, res).all()
+    critical = jg.wrench_resistance(jg.Grasp(position, normal, jg.HardFinger(np.tan(a))))
+    assert abs(float(critical.margin)) < 1e-8
+    assert critical.status in (Status.MARGINAL, Status.NOT_RESISTANT, Status.RESISTANT)
+
+
+def test_no_internal_force_with_a_normal_part_gives_minus_infinity():
+    """Two parallel normals, one plane apart: nothing pushes back."""
+    position = np.array([[[-1.0, 0], [1, 0]]])
+    normal = np.array([[[0.0, 1], [0, 1]]])
+    grasp = jg.Grasp(position, normal, jg.HardFinger(np.zeros((1, 2))))
+    res = jg.wrench_resistance(grasp)
+    assert res.margin[0] == -np.inf
+    assert res.gap[0] == 0
+    assert res.status[0] == Status.NOT_RESISTANT
+    np.testing.assert_allclose(res.escape_twist[0], [0, 1, 0], atol=1e-12)
+    assert jg.check_certificate(grasp, res).all()
+
+
+BAD = {
+    "nan position": ("position", np.nan),
+    "infinite position": ("position", np.inf),
+    "nan normal": ("normal", np.nan),
+    "zero normal": ("normal", 0.0),
+    "negative friction": ("friction", -0.1),
+    "nan friction": ("friction", np.nan),
+    "infinite friction": ("friction", np.inf),
+    "negative torsion": ("torsion", -0.1),
+    "nothing active": ("active", False),
+}
+
+
+@pytest.fixture(scope="module")
+def batch(dtype):
+    rng = np.random.default_rng(3)
+    n, k = 150, 6
+    position, normal, _ = random_contacts(rng, n, k, 3)
+    friction, torsion = random_coefficients(rng, n, k)
+    return {
+        "position": position.astype(dtype),
+        "normal": normal.astype(dtype),
+        "friction": friction.astype(dtype),
+        "torsion": torsion.astype(dtype),
+        "active": random_active(rng, n, k),
+    }
+
+
+def build(arrays):
+    model = jg.SoftFinger(arrays["friction"], arrays["torsion"])
+    return jg.Grasp(arrays["position"], arrays["normal"], model, arrays["active"])
+
+
+def assert_same_bits(a, b):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        assert np.asarray(x).tobytes() == np.asarray(y).tobytes()
+
+
+@F32
+def test_bad_numbers_make_their_own_lane_invalid_and_touch_no_other(batch):
+    clean = jg.wrench_resistance(build(batch))
+    dirty = {name: value.copy() for name, value in batch.items()}
+    lanes = list(range(5, 5 + 13 * len(BAD), 13))
+    for lane, (field, value) in zip(lanes, BAD.values(), strict=True):
+        dirty[field][lane, 0 if field != "active" else slice(None)] = value
+    grasp = build(dirty)
+    res = jg.wrench_resistance(grasp)
+    assert (np.asarray(res.status)[lanes] == Status.INVALID).all()
+    for name in ("margin", "gap", "rank"):
+        assert np.isnan(np.asarray(getattr(res, name))[lanes]).all(), name
+    others = np.setdiff1d(np.arange(len(res.status)), lanes)
+    assert_same_bits(*(jax.tree.map(lambda x: np.asarray(x)[others], r) for r in (clean, res)))
+    assert jg.check_certificate(grasp, res).all()
+
+
+@F32
+@pytest.mark.parametrize("verdict_only", [False, True])
+def test_bits_do_not_depend_on_batch_neighbours_or_position(batch, verdict_only):
+    grasp = build(batch)
+    whole = jg.wrench_resistance(grasp, verdict_only=verdict_only)
+    for count in (1, 2, 63, 64, 65, 149):
+        part = jg.wrench_resistance(grasp[np.arange(count)], verdict_only=verdict_only)
+        assert_same_bits(jax.tree.map(lambda x, n=count: x[:n], whole), part)
+    order = np.random.default_rng(0).permutation(150)
+    shuffled = jg.wrench_resistance(grasp[order], verdict_only=verdict_only)
+    assert_same_bits(jax.tree.map(lambda x: x[order], whole), shuffled)
+
+
+def test_bits_do_not_depend_on_the_tile(batch, monkeypatch):
+    from jaxgrasp import resistance
+
+    whole = jg.wrench_resistance(build(batch))
+    for width in (16, 32):
+        monkeypatch.setattr(resistance, "tile_width", lambda _, w=width: w)
+        assert_same_bits(whole, jg.wrench_resistance(build(batch)))
+
+
+def test_padding_does_not_change_a_bit(batch):
+    few = {name: value[:40] for name, value in batch.items()}
+    few["active"] = np.tile(np.arange(6) < 4, (40, 1))
+    short = {name: value[:, :4] for name, value in few.items()}
+    long, cut = jg.wrench_resistance(build(few)), jg.wrench_resistance(build(short))
+    np.testing.assert_array_equal(long.status, cut.status)
+    np.testing.assert_allclose(long.margin, cut.margin, rtol=1e-9, atol=2e-8)
+    assert (np.asarray(long.internal_force).reshape(40, 6, 4)[:, 4:] == 0).all()
+
+
+def test_batch_axes_jit_and_vmap_agree_bit_for_bit(batch):
+    grasp = build(batch)
+    flat = jg.wrench_resistance(grasp)
+    folded = build({name: value.reshape(3, 50, *value.shape[1:]) for name, value in batch.items()})
+    expected = jax.tree.map(lambda x: x.reshape(3, 50, *x.shape[1:]), flat)
+    assert_same_bits(expected, jg.wrench_resistance(folded))
+    assert_same_bits(expected, jax.jit(jg.wrench_resistance)(folded))
+    assert_same_bits(flat, jax.vmap(jg.wrench_resistance)(grasp))
+    assert_same_bits(expected, jax.vmap(jax.vmap(jg.wrench_resistance))(folded))
+    assert_same_bits(jax.tree.map(lambda x: x[7], flat), jg.wrench_resistance(grasp[7]))
+
+
+@F32
+def test_verdict_only_agrees_and_stops_earlier(batch):
+    grasp = build(batch)
+    full, quick = jg.wrench_resistance(grasp), jg.wrench_resistance(grasp, verdict_only=True)
+    decided = (np.asarray(full.status) < Status.MARGINAL) & (np.asarray(quick.status) < Status.MARGINAL)
+    assert decided.mean() > 0.97
+    np.testing.assert_array_equal(np.asarray(full.status)[decided], np.asarray(quick.status)[decided])
+    assert np.asarray(quick.iterations).sum() < 0.5 * np.asarray(full.iterations).sum()
+    assert jg.check_certificate(grasp, quick).all()
+
+
+@F32
+def test_dtype_is_kept(batch, dtype):
+    res = jg.wrench_resistance(build(batch))
+    for name in ("margin", "gap", "rank", "internal_force", "escape_twist"):
+        assert getattr(res, name).dtype == dtype
+    assert res.status.dtype == res.iterations.dtype == res.stop.dtype == jnp.int32
+
+
+def test_units_do_not_change_the_verdict(batch):
+    base = jg.wrench_resistance(build(batch))
+    millimetres = dict(batch, position=batch["position"] * 1e3, torsion=batch["torsion"] * 1e3)
+    scaled = jg.wrench_resistance(build(millimetres))
+    np.testing.assert_array_equal(base.status, scaled.status)
+    np.testing.assert_allclose(base.margin, scaled.margin, rtol=1e-7, atol=2e-8)
+
+
+def test_wrong_structure_raises_at_trace_time(batch):
+    grasp = build(batch)
+    with pytest.raises(ValueError, match=r"jaxgrasp\.Grasp"):
+        jg.wrench_resistance(np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="positive"):
+        jg.wrench_resistance(grasp, tolerance=0.0)
+    with pytest.raises(ValueError, match="planar soft finger"):
+        jg.Grasp(np.zeros((2, 2)), np.ones((2, 2)), jg.SoftFinger())
+
+
+def test_status_numbers_and_sentences_are_fixed():
+    assert [s.value for s in Status] == [1, 2, 3, 4, 5]
+    assert all(s.sentence.endswith(".") for s in Status)
+    assert [s.value for s in Stop] == [0, 1, 2, 3, 4, 5]
+    assert all(s.sentence.endswith(".") for s in Stop)
