@@ -1,4 +1,4 @@
-"""Start-up on whatever machine this is: an absent or broken accelerator means the CPU and one line, not a traceback."""
+"""Start-up on whatever machine this is: without a working accelerator, the CPU and one line."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ __all__ = ["precision", "usable_backend"]
 
 
 def usable_backend(say: Callable[[str], None]) -> str:
-    """Name of the backend that works ("cpu", "gpu", ..): JAX's own choice, or the CPU after one line to ``say``."""
+    """Name of the backend that works ("cpu", "gpu"): JAX's choice, or the CPU after one line to ``say``."""
     try:
         jax.devices()
         jnp.zeros(8).block_until_ready()  # a driver may list a device that cannot compute
-    except RuntimeError as error:
-        wanted = jax.config.jax_platforms or "the default backend"
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    except (RuntimeError, AssertionError) as error:  # JAX asserts where no backend of that name is installed
+        wanted = jax.config.jax_platforms or "the default backend"  # pyright: ignore
+        reason = str(error).splitlines()[0] if str(error) else "not installed"
         clear_backends()
         jax.config.update("jax_platforms", "cpu")
         jax.devices()
@@ -30,7 +30,7 @@ def usable_backend(say: Callable[[str], None]) -> str:
 @contextmanager
 def precision(dtype: str) -> Iterator[None]:
     """Allow arrays of ``dtype``: 64-bit arrays must be enabled before the first one is made."""
-    before = jax.config.jax_enable_x64
+    before = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
     if dtype == "float64":
         jax.config.update("jax_enable_x64", True)
     try:

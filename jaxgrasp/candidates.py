@@ -1,11 +1,12 @@
 """Candidate contacts on a surface, drawn from a seed: row i is the same whatever else is drawn.
 
-Area-weighted points: ``p = a + u e_1 + v e_2`` on a triangle chosen with probability ``A_j / sum A``, normal inwards.
-Antipodal pairs: such a point, a ray into the body within the friction cone of its normal, and the point where the
-ray first leaves the body, with its own inward normal (Nguyen, Constructing force-closure grasps, 1988).
+Area-weighted points: ``p = a + u e_1 + v e_2`` on a triangle chosen with probability ``A_j / sum A``,
+normal inwards. Antipodal pairs: such a point, a ray into the body within the friction cone of its normal,
+and the point where the ray first leaves the body, with its own inward normal (Nguyen, Constructing
+force-closure grasps, 1988).
 
-Rows come in blocks of ``BLOCK``. A block's numbers depend on (seed, block) and nothing else, so any range of rows can
-be drawn at any time, in any order, on any number of threads.
+Rows come in blocks of ``BLOCK``. A block's numbers depend on (seed, block) and nothing else, so any range
+of rows can be drawn at any time, in any order, on any number of threads.
 """
 
 from __future__ import annotations
@@ -105,7 +106,7 @@ class SurfaceSampler(_Blocks):
 class AntipodalSampler(_Blocks):
     """Pairs of contacts joined by a line that starts within the friction cone of the first.
 
-    friction  mu of the first contact: the ray's angle to the normal is at most atan(mu), uniform over the cone's base
+    friction  mu of the first contact: the ray is within atan(mu) of the normal, uniform over the cone's base
 
     A ray that leaves through a hole of an open mesh is drawn again.
     """
@@ -132,7 +133,7 @@ class AntipodalSampler(_Blocks):
             if done == BLOCK:
                 return position, normal
         raise UserError(
-            "almost no ray into the mesh finds a second contact: the mesh is open or its faces point inwards; "
+            "rays into the mesh find no second contact: the mesh is open or its faces point inwards; "
             "repair it, or take --sampler surface"
         )
 
@@ -169,7 +170,7 @@ def _check(fingers: int, seed: int) -> None:
 def geometric_filter(
     position: np.ndarray, normal: np.ndarray, friction: np.ndarray, active: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """For each reason to drop a grasp before solving it, the rows (n,) it concerns; a row has one reason at most."""
+    """For each reason to drop a grasp unsolved, the rows (n,) it concerns; a row has one reason at most."""
     slide = slide_escapes(normal, friction, active)
     with np.errstate(invalid="ignore"):
         apart = np.linalg.norm(position[:, :, None] - position[:, None], axis=-1)
@@ -182,10 +183,10 @@ def geometric_filter(
 
 
 def slide_escapes(normal: np.ndarray, friction: np.ndarray, active: np.ndarray) -> np.ndarray:
-    """True where a slide along the mean normal d meets no finger: ``n_i . d > mu_i |d - (n_i . d) n_i|`` for all i.
+    """``n_i . d > mu_i |d - (n_i . d) n_i|`` for all i: a slide along the mean normal d meets no finger.
 
-    Such a slide is an escape twist, so these grasps are certainly not resistant. normal (n, k, 3) of any length,
-    friction and active (n, k). A hundredth of the cone is kept in hand for rounding.
+    Such a slide is an escape twist, so these grasps are certainly not resistant. normal (n, k, 3) of any
+    length, friction and active (n, k). A hundredth of the cone is kept in hand for rounding.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         unit = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -193,5 +194,7 @@ def slide_escapes(normal: np.ndarray, friction: np.ndarray, active: np.ndarray) 
         direction = total / np.linalg.norm(total, axis=-1, keepdims=True)
         along = np.einsum("nkj,nj->nk", unit, direction)
         across = np.sqrt(np.maximum(0.0, 1 - along * along))
-        slips = along > 1.01 * friction * across + 1e-9  # False for NaN: those go to the solver, which says INVALID
+        slips = (
+            along > 1.01 * friction * across + 1e-9
+        )  # False for NaN: those go to the solver, which says INVALID
     return active.any(axis=-1) & (slips | ~active).all(axis=-1)

@@ -9,7 +9,14 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 
 from .errors import UserError
@@ -21,13 +28,14 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode="rich",
-    help="Does this grasp hold? Wrench resistance (force closure) of many grasps at once, every verdict with its proof.",
+    pretty_exceptions_enable=False,
+    help="Does this grasp hold? Wrench resistance (force closure) of many grasps at once, with proofs.",
 )
 
 SCREEN_HELP = """Screen many candidate grasps of one object and write a verdict for each.
 
-OBJECT is a mesh file (anything trimesh reads, also .gz), a built-in object (see [bold]jaxgrasp objects[/bold]) or a
-Parquet file of contacts with the columns position and normal.
+OBJECT is a mesh file (anything trimesh reads, also .gz), a built-in object (see [bold]jaxgrasp
+objects[/bold]) or a Parquet file of contacts with the columns position and normal.
 
 Examples:
 
@@ -67,7 +75,9 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
-    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
 ) -> None:
     pass
 
@@ -80,30 +90,50 @@ def _com(text: str | None) -> tuple[float, ...] | None:
     except ValueError:
         values = ()
     if len(values) != 3:
-        raise UserError(f"--com must be three numbers x,y,z in m without spaces, such as 0,0,0.05, got {text!r}")
+        raise UserError(
+            f"--com must be three numbers x,y,z in m without spaces, such as 0,0,0.05, got {text!r}"
+        )
     return values
 
 
 @app.command(help=SCREEN_HELP)
 def screen(
-    source: Annotated[str, typer.Argument(metavar="OBJECT", help="Mesh file, built-in object, or Parquet file.")],
-    fingers: Annotated[int | None, typer.Option("--fingers", "-k", help="Contacts a grasp, K.  [default: 4]")] = None,
-    model: Annotated[str | None, typer.Option(help="hard, soft or frictionless.  [default: hard]")] = None,
-    friction: Annotated[float | None, typer.Option(help="Coulomb coefficient mu >= 0.  [default: 0.5]")] = None,
+    source: Annotated[
+        str, typer.Argument(metavar="OBJECT", help="Mesh file, built-in object, or Parquet file.")
+    ],
+    fingers: Annotated[
+        int | None, typer.Option("--fingers", "-k", help="Contacts a grasp, K (default: 4).")
+    ] = None,
+    model: Annotated[str | None, typer.Option(help="hard, soft or frictionless (default: hard).")] = None,
+    friction: Annotated[
+        float | None, typer.Option(help="Coulomb coefficient mu >= 0 (default: 0.5).")
+    ] = None,
     torsion: Annotated[
-        float | None, typer.Option(help="gamma >= 0 in m of a soft finger: its torque is at most gamma f_n.  [default: 0.01]")
+        float | None,
+        typer.Option(
+            help="gamma >= 0 in m of a soft finger: its torque is at most gamma f_n (default: 0.01)."
+        ),
     ] = None,
-    samples: Annotated[int | None, typer.Option("--samples", "-n", help="Candidates.  [default: 100000]")] = None,
+    samples: Annotated[
+        int | None, typer.Option("--samples", "-n", help="Candidates (default: 100000).")
+    ] = None,
     seed: Annotated[int, typer.Option(help="The same seed gives the same file.")] = 0,
-    unit: Annotated[str, typer.Option(help="Unit of the mesh file's numbers: m, cm, mm or in. Never guessed.")] = "m",
+    unit: Annotated[
+        str, typer.Option(help="Unit of the mesh file's numbers: m, cm, mm or in. Never guessed.")
+    ] = "m",
     com: Annotated[
-        str | None, typer.Option(metavar="X,Y,Z", help="Centre of mass in m, mesh frame.  [default: the mesh's]")
+        str | None,
+        typer.Option(metavar="X,Y,Z", help="Centre of mass in m, mesh frame (default: the mesh's)."),
     ] = None,
-    dtype: Annotated[str, typer.Option(help="float64, or float32: faster, less certain near margin 0.")] = "float64",
+    dtype: Annotated[
+        str, typer.Option(help="float64, or float32: faster, less certain near margin 0.")
+    ] = "float64",
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Parquet file.  [default: OBJECT.grasps.parquet]")
+        Path | None, typer.Option("--output", "-o", help="Parquet file (default: OBJECT.grasps.parquet).")
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with an unfinished run of the same options.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with an unfinished run of the same options.")
+    ] = False,
     verdict_only: Annotated[
         bool, typer.Option("--verdict-only", help="Stop at the first proof; the margin is then only a bound.")
     ] = False,
@@ -112,10 +142,13 @@ def screen(
         str, typer.Option(help="surface, antipodal, or auto: antipodal for two soft fingers, else surface.")
     ] = "auto",
     filter: Annotated[
-        bool, typer.Option("--filter", help="Leave hopeless candidates out before solving; says how many and why.")
+        bool,
+        typer.Option("--filter", help="Leave hopeless candidates out before solving; says how many and why."),
     ] = False,
     chunk: Annotated[int, typer.Option(help="Grasps solved together; memory grows with it.")] = 65536,
-    threads: Annotated[int | None, typer.Option(help="Chunks worked on at a time.  [default: 2, or 1 on one core]")] = None,
+    threads: Annotated[
+        int | None, typer.Option(help="Chunks worked on at a time (default: 2, or 1 on one core).")
+    ] = None,
 ) -> None:
     from .backend import precision, usable_backend
     from .run import Request, prepare
@@ -138,8 +171,8 @@ def screen(
             with _Bar(console, run.candidates) as bar:
                 summary = start(run, resume, bar.show)
         except KeyboardInterrupt:
-            again = "" if resume else " --resume"
-            _say(f"stopped; the finished part is in {run.output}.parts, go on with the same command and{again or ' it'}")
+            again = "" if resume else " and --resume"
+            _say(f"stopped; the finished part is in {run.output}.parts: go on with the same command{again}")
             raise
     _print_summary(summary, run)
 
@@ -176,29 +209,40 @@ class _Bar:
             return
         rate = (summary.done - summary.resumed) / max(summary.seconds, 1e-9)
         told = f"{rate:,.0f} grasps/s, {100 * summary.share(Status.RESISTANT):.1f} % resistant"
-        self.progress.update(self.task, description="solving", completed=summary.done, told=told)
+        stage = "writing" if summary.done >= summary.candidates else "solving"
+        self.progress.update(self.task, description=stage, completed=summary.done, told=told)
 
 
 def _print_summary(summary, run) -> None:
     from .status import Status
 
     console = Console()
-    table = Table(title=f"{run.metadata['command'].split()[2]}: {summary.rows:,} grasps")
+    about = run.metadata.get("contacts") or run.metadata["object"]
+    name = Path(about["name"]).name
+    table = Table(title=f"{name}: {summary.rows:,} grasps")
     table.add_column("verdict")
     table.add_column("grasps", justify="right")
     table.add_column("share", justify="right")
     for status in Status:
         if summary.counts.get(status):
-            name = status.name.replace("_", " ").lower()
-            table.add_row(name, f"{summary.counts[status]:,}", f"{100 * summary.share(status):.2f} %")
+            words = status.name.replace("_", " ").lower()
+            table.add_row(words, f"{summary.counts[status]:,}", f"{100 * summary.share(status):.2f} %")
     for reason, number in summary.removed.items():
         table.add_row(f"left out by --filter: {reason}", f"{number:,}", "")
     console.print(table)
-    quantiles = (("min", 0.0), ("5 %", 0.05), ("25 %", 0.25), ("median", 0.5), ("75 %", 0.75), ("95 %", 0.95), ("max", 1.0))
+    quantiles = (
+        ("min", 0.0),
+        ("5 %", 0.05),
+        ("25 %", 0.25),
+        ("median", 0.5),
+        ("75 %", 0.75),
+        ("95 %", 0.95),
+        ("max", 1.0),
+    )
     margins = Table(title="margin (a lower bound)" if run.verdict_only else "margin")
     values = []
-    for name, q in quantiles:
-        margins.add_column(name, justify="right")
+    for words, q in quantiles:
+        margins.add_column(words, justify="right")
         values.append(f"{summary.quantile(q):.3f}")
     margins.add_row(*values)
     console.print(margins)
@@ -209,6 +253,7 @@ def _print_summary(summary, run) -> None:
             f"{overall:,.0f} grasps/s overall, {solver:,.0f} in the solver; {summary.seconds:.1f} s"
             f" after {summary.compile_seconds:.1f} s of compiling",
             highlight=False,
+            soft_wrap=True,
         )
     if summary.resumed:
         console.print(f"{summary.resumed:,} candidates were already done", highlight=False)
@@ -224,10 +269,12 @@ def explain(
         str | None, typer.Option("--object", help="The mesh to draw, if it is not where the run found it.")
     ] = None,
 ) -> None:
+    from .backend import usable_backend
     from .formats.parquet import read_row
     from .report import Verdict, draw, reprove
     from .report import explain as words
 
+    usable_backend(_say)
     values, metadata = read_row(file, row)
     verdict = Verdict.from_row(values, metadata)
     print(f"Row {row} of {file} (grasp {values['grasp_id']}, {verdict.model} contacts):")
@@ -264,17 +311,29 @@ def objects() -> None:
     from .objects import OBJECTS, make
 
     table = Table()
-    for name, side in (("name", "left"), ("size (cm)", "right"), ("volume (cm3)", "right"), ("faces", "right"), ("what", "left")):
+    for name, side in (
+        ("name", "left"),
+        ("size (cm)", "right"),
+        ("volume (cm3)", "right"),
+        ("faces", "right"),
+        ("what", "left"),
+    ):
         table.add_column(name, justify=side)  # pyright: ignore[reportArgumentType]
     for name, function in OBJECTS.items():
         mesh = make(name)
         size = " x ".join(f"{100 * e:.1f}" for e in mesh.extents)
-        table.add_row(name, size, f"{1e6 * mesh.volume:.0f}", f"{len(mesh.faces):,}", (function.__doc__ or "").splitlines()[0])
+        table.add_row(
+            name,
+            size,
+            f"{1e6 * mesh.volume:.0f}",
+            f"{len(mesh.faces):,}",
+            (function.__doc__ or "").splitlines()[0],
+        )
     Console().print(table)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; the exit code: 0, 2 for a user's error (one line on stderr), 130 when interrupted."""
+    """Run the command line. Exit code: 0; 2 for a user's error (one line on stderr); 130 if interrupted."""
     try:
         code = app(args=arguments, standalone_mode=False)
     except UserError as error:

@@ -1,14 +1,16 @@
-"""Grasps drawn with matplotlib (extra ``viz``): object, contacts, friction cones, forces, and the way it escapes."""
+"""Grasps drawn with matplotlib (extra ``viz``): contacts, friction cones, forces, and the way out."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from .errors import UserError
+from .geometry import contact_frame
 
 if TYPE_CHECKING:
     import trimesh
@@ -22,8 +24,10 @@ BODY, CONTACT, FORCE, ESCAPE = (0.62, 0.68, 0.75), "#d1495b", "#00798c", "#edae4
 MOST_FACES = 6000
 
 
-def moved(points: np.ndarray, motion: Screw, centre_of_mass: np.ndarray, size: float, step: float) -> np.ndarray:
-    """``points`` after the motion: a turn of ``step`` rad (Rodrigues) and its advance, or a slide of step * size."""
+def moved(
+    points: np.ndarray, motion: Screw, centre_of_mass: np.ndarray, size: float, step: float
+) -> np.ndarray:
+    """``points`` after a turn of ``step`` rad (Rodrigues) and its advance, or a slide of step * size."""
     if motion.kind == "slide" or motion.point is None:
         return points + step * size * motion.direction
     arm, axis = points - motion.point, motion.direction
@@ -34,21 +38,25 @@ def moved(points: np.ndarray, motion: Screw, centre_of_mass: np.ndarray, size: f
         + np.cross(axis, arm) * np.sin(angle)
         + (arm @ axis)[:, None] * axis * (1 - np.cos(angle))
     )
-    advance = np.clip(motion.pitch * angle, -step * size, step * size)
+    bound = abs(step) * size
+    advance = np.clip(motion.pitch * angle, -bound, bound)
     return motion.point + turned + advance * axis
 
 
-def view_of(verdict: Verdict) -> tuple[float, float]:
-    """Elevation and azimuth in degrees that show the contacts: their normals seen from the side, never edge on."""
+def view_of(verdict: Verdict, points: np.ndarray) -> tuple[float, float]:
+    """Elevation and azimuth in degrees from which contacts face us and ``points`` spread out."""
     normals = verdict.normal[verdict.active]
-    best, chosen = -1.0, (20.0, -60.0)
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    spread = np.cov(points.T, bias=True)
+    spread = spread / max(float(np.linalg.eigvalsh(spread)[-1]), 1e-300)
+    best, chosen = -np.inf, (20.0, -60.0)
     for azimuth in range(-180, 180, 15):
         for elevation in (15.0, 30.0, 45.0):
             a, e = np.radians(azimuth), np.radians(elevation)
             eye = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
             facing = -(normals @ eye)  # 1 where the contact's outer side looks at us
-            score = float(np.minimum(facing + 0.2, 0.6).sum())
-            if score > best or best == -1.0:
+            score = float(np.minimum(facing + 0.2, 0.6).mean() - eye @ spread @ eye)
+            if score > best:
                 best, chosen = score, (elevation, float(azimuth))
     return chosen
 
@@ -69,6 +77,8 @@ def _arrow(axes, start, along, colour, width=2.0) -> None:
 
 
 def _cone(axes, point, normal, friction, length) -> None:
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
     helper = np.eye(3)[np.argmin(np.abs(normal))]
     first = np.cross(normal, helper)
     first /= np.linalg.norm(first)
@@ -76,23 +86,24 @@ def _cone(axes, point, normal, friction, length) -> None:
     turn = np.linspace(0, 2 * np.pi, 25)[:, None]
     # Drawn outside the body, where the finger is: the forces that this finger may press with.
     rim = point - length * (normal + friction * (np.cos(turn) * first + np.sin(turn) * second))
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     sides = [[point, rim[j], rim[j + 1]] for j in range(len(turn) - 1)]
     axes.add_collection3d(Poly3DCollection(sides, facecolors=CONTACT, alpha=0.25, linewidths=0, zorder=20))
 
 
 def picture(verdict: Verdict, motion: Screw | None, path: Path, mesh: trimesh.Trimesh | None) -> None:
-    """Write a picture to ``path``; its suffix (png, svg, pdf) is the format. The file appears whole or not at all."""
+    """Write a picture to ``path``, whole or not at all; the suffix (png, svg, pdf) is the format."""
     try:
         import matplotlib
         from matplotlib.figure import Figure
     except ImportError as error:
         raise UserError("pictures need matplotlib: pip install 'jaxgrasp[viz]'") from error
     figure = Figure(figsize=(7, 6.4), dpi=150)
-    axes = figure.add_axes((0.0, 0.0, 1.0, 0.9), projection="3d", computed_zorder=False)
+    axes: Any = figure.add_axes((0.0, 0.0, 1.0, 0.9), projection="3d", computed_zorder=False)
     size, com = verdict.size, verdict.centre_of_mass
     shown = [verdict.position[verdict.active]]
+    if mesh is not None:
+        size = max(size, 0.4 * float(np.max(mesh.extents)))
     if mesh is not None:
         mesh = _simpler(mesh)
         points = np.asarray(mesh.vertices)
@@ -114,17 +125,20 @@ def picture(verdict: Verdict, motion: Screw | None, path: Path, mesh: trimesh.Tr
         shown.append((point - 1.3 * length * n)[None])
     axes.scatter(*com, color="black", marker="+", s=60, depthshade=False, zorder=25)
     if motion is not None:
-        _draw_motion(axes, motion, com, size)
+        shown.append(_draw_motion(axes, motion, com, size))
     everything = np.concatenate(shown)
     low, high = everything.min(axis=0), everything.max(axis=0)
-    middle, half = (low + high) / 2, 0.5 * float((high - low).max())
-    axes.set(xlim=middle[0] + np.array([-half, half]), ylim=middle[1] + np.array([-half, half]))
-    axes.set(zlim=middle[2] + np.array([-half, half]))
-    axes.set_box_aspect((1, 1, 1), zoom=1.25)
+    margin = 0.02 * float((high - low).max())
+    low, high = low - margin, high + margin
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    sides = (high - low) / np.linalg.norm(high - low)
+    axes.set_box_aspect(high - low, zoom=0.95 / np.sqrt(sides.max()))
     axes.set_axis_off()
-    axes.view_init(*view_of(verdict))
+    axes.view_init(*view_of(verdict, everything))
     kind = "" if motion is None else f": it escapes by a {motion.kind}"
-    figure.suptitle(f"{verdict.status.name.replace('_', ' ').lower()}{kind}, margin {verdict.margin:.3f}", y=0.96)
+    figure.suptitle(
+        f"{verdict.status.name.replace('_', ' ').lower()}{kind}, margin {verdict.margin:.3f}", y=0.96
+    )
     beside = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
         with matplotlib.rc_context({"svg.hashsalt": "jaxgrasp"}):
@@ -142,23 +156,22 @@ def _undated(path: Path) -> dict[str, None] | None:
     return {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(path.suffix.lower())
 
 
-def _world_force(verdict: Verdict, i: int, n: np.ndarray) -> np.ndarray:
+def _world_force(verdict: Verdict, i, n: np.ndarray) -> np.ndarray:
     """Contact i's force in mesh axes, N, in the frame convention of ``geometry.contact_frame``."""
-    from .geometry import contact_frame
-
     assert verdict.force is not None
     if verdict.force.shape[1] == 1:
         return verdict.force[i, 0] * n
-    first, second = (np.asarray(t, float) for t in contact_frame(n))
+    first, second = (np.asarray(t, float) for t in contact_frame(jnp.asarray(n)))
     f_x, f_y, f_n = verdict.force[i, :3]
     return f_x * first + f_y * second + f_n * n
 
 
-def _draw_motion(axes, motion: Screw, com: np.ndarray, size: float) -> None:
-    reach = 1.6 * size
+def _draw_motion(axes, motion: Screw, com: np.ndarray, size: float) -> np.ndarray:
+    """The axis, or the direction of a slide; returns points that the picture must show."""
+    reach = 1.2 * size
     if motion.kind == "slide" or motion.point is None:
-        _arrow(axes, com, 1.2 * size * motion.direction, ESCAPE, 3.5)
-        return
+        _arrow(axes, com, reach * motion.direction, ESCAPE, 3.5)
+        return (com + reach * motion.direction)[None]
     ends = motion.point + reach * np.array([[-1.0], [1.0]]) * motion.direction
     axes.plot(*ends.T, color=ESCAPE, linewidth=2, linestyle="--", zorder=28)
     _arrow(axes, motion.point + 0.8 * reach * motion.direction, 0.4 * reach * motion.direction, ESCAPE, 3)
@@ -168,9 +181,14 @@ def _draw_motion(axes, motion: Screw, com: np.ndarray, size: float) -> None:
     first /= np.linalg.norm(first)
     second = np.cross(motion.direction, first)
     turn = np.linspace(0, 1.5 * np.pi, 60)[:, None]
-    arc = motion.point + 0.8 * reach * motion.direction + 0.25 * size * (np.cos(turn) * first + np.sin(turn) * second)
+    arc = (
+        motion.point
+        + 0.8 * reach * motion.direction
+        + 0.25 * size * (np.cos(turn) * first + np.sin(turn) * second)
+    )
     axes.plot(*arc.T, color=ESCAPE, linewidth=2.5, zorder=29)
     _arrow(axes, arc[-2], 4 * (arc[-1] - arc[-2]), ESCAPE, 2.5)
+    return np.concatenate([ends, arc])
 
 
 def _simpler(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -183,7 +201,9 @@ def _simpler(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         where = np.round(np.asarray(mesh.vertices) / step).astype(np.int64)
         _, first, inverse = np.unique(where, axis=0, return_index=True, return_inverse=True)
         faces = inverse.reshape(-1)[np.asarray(mesh.faces)]
-        faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+        faces = faces[
+            (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+        ]
         mesh = trimesh.Trimesh(np.asarray(mesh.vertices)[first], faces, process=False)
         cells = cells * 3 // 4
     return mesh

@@ -6,4 +6,4 @@ __all__ = ["UserError"]
 
 
 class UserError(ValueError):
-    """Something a user can put right; the message is one line that says how. The command line prints it as is."""
+    """Something a user can put right; the message is one line that says how."""

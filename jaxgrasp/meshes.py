@@ -1,8 +1,8 @@
 """A body: a triangle mesh in metres, its centre of mass, and what is doubtful about it.
 
-The centre of mass of a watertight mesh is that of the volume inside, at uniform density; otherwise the surface's,
-``sum_j A_j c_j / sum_j A_j`` over triangles of area A_j and centroid c_j. Reading a file runs no code from it and opens no
-network connection.
+The centre of mass of a watertight mesh is that of the volume inside, at uniform density; otherwise the
+surface's, ``sum_j A_j c_j / sum_j A_j`` over triangles of area A_j and centroid c_j. Reading a file runs no
+code from it and opens no network connection.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 import trimesh
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components
+from trimesh.resolvers import FilePathResolver
 
 from . import objects
 from .errors import UserError
@@ -57,7 +58,7 @@ def load(source: str | Path, unit: str = "m", com=None) -> Body:
     unit  m, cm, mm or in: what one unit of the file's numbers is. Never guessed.
     com   (3,) centre of mass in m, mesh frame; by default computed from the mesh
 
-    Raises UserError for an unknown unit or object, a missing or unreadable file, and a mesh without a surface.
+    Raises UserError for an unknown unit or object, an unreadable file, and a mesh without a surface.
     """
     if unit not in METRES_PER:
         raise UserError(f"unknown unit {unit!r}; take one of {', '.join(METRES_PER)}")
@@ -106,21 +107,27 @@ def _parse(path: Path, data: bytes) -> trimesh.Trimesh:
     inner = path
     if path.suffix.lower() == ".gz" and not path.name.lower().endswith(".tar.gz"):
         inner, data = path.with_suffix(""), _unpack(path, data)
-    kind = inner.suffix.lower().lstrip(".")
     readable = sorted(f for f in trimesh.available_formats() if f not in ("dxf", "svg"))
-    if kind not in readable:
-        raise UserError(f"{path}: {kind or 'a file without a suffix'} is no mesh format; readable: {', '.join(readable)}")
-    resolver = trimesh.resolvers.FilePathResolver(str(path))
+    kind = next((f for f in readable if inner.name.lower().endswith(f".{f}")), None)
+    if kind is None:
+        what = inner.suffix or "a file without a suffix"
+        raise UserError(f"{path}: {what} is no mesh format; readable: {', '.join(readable)}")
+    resolver = FilePathResolver(str(path))
     try:
         scene = trimesh.load_scene(
-            io.BytesIO(data), file_type=kind, resolver=resolver, allow_remote=False, skip_materials=True
+            io.BytesIO(data),
+            file_type=kind,
+            resolver=resolver,
+            allow_remote=False,
+            skip_materials=True,
+            process=False,
         )
         parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     except Exception as error:  # parsers of foreign bytes raise anything
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UserError(f"{path} cannot be read as {kind}: {reason}") from error
     if not parts:
-        raise UserError(f"{path} holds no faces, so it has no surface to grasp; export it as triangles")
+        raise UserError(f"{path} holds no faces, so it has no surface to grasp; export triangles, undamaged")
     offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
     vertices = np.concatenate([np.asarray(part.vertices, np.float64) for part in parts])
     faces = np.concatenate([np.asarray(part.faces) + o for part, o in zip(parts, offsets, strict=True)])
@@ -138,7 +145,9 @@ def _orient(mesh: trimesh.Trimesh) -> list[str]:
     """Turn the faces of a closed mesh outwards; say so where anything had to be turned."""
     if not mesh.is_watertight:
         outside_in = _signed_volume(mesh.triangles) < 0
-        return ["the faces seem to point inwards: contact normals may be reversed; check the mesh"] * bool(outside_in)
+        return ["the faces seem to point inwards: contact normals may be reversed; check the mesh"] * bool(
+            outside_in
+        )
     turned = False
     if not mesh.is_winding_consistent:
         mesh.faces = _consistent_winding(mesh)
@@ -146,7 +155,9 @@ def _orient(mesh: trimesh.Trimesh) -> list[str]:
     if mesh.volume < 0:
         mesh.invert()
         turned = True
-    return ["some faces pointed inwards; they were turned so that all normals point out of the volume"] * turned
+    return [
+        "some faces pointed inwards; they were turned so that all normals point out of the volume"
+    ] * turned
 
 
 def _signed_volume(triangles: np.ndarray) -> float:
@@ -188,11 +199,13 @@ def _suspect_unit(mesh: trimesh.Trimesh, unit: str) -> list[str]:
         return []
     size = " x ".join(f"{e:.4g}" for e in mesh.extents)
     what = "larger than 2 m" if largest > LARGEST else "smaller than 1 mm"
-    return [f"the object measures {size} m, {what}, read in {unit}; if that is wrong, take --unit m, cm, mm or in"]
+    return [
+        f"the object measures {size} m, {what}, read in {unit}; if that is wrong, take --unit m, cm, mm or in"
+    ]
 
 
 def _centre_of_mass(mesh: trimesh.Trimesh, watertight: bool) -> tuple[np.ndarray, bool]:
-    """Centre of mass in m, and whether it is the volume's. Integrated about the middle, where rounding is least."""
+    """Centre of mass in m, and whether it is the volume's. Integrated about the middle: least rounding."""
     middle = mesh.bounds.mean(axis=0)
     triangles = np.asarray(mesh.triangles) - middle
     if watertight:
@@ -212,8 +225,13 @@ def _body(mesh, name: str, sha256: str, unit: str, com, warnings: list[str]) -> 
         if centre.shape != (3,) or not np.isfinite(centre).all():
             raise UserError(f"the centre of mass must be three finite numbers x, y, z in m, got {com}")
     if not watertight:
-        consequence = "the centre of mass is the surface's, not the volume's (--com sets it), and " * (not of_volume)
+        consequence = "the centre of mass is the surface's, not the volume's (--com sets it), and " * (
+            not of_volume
+        )
         warnings = [*warnings, f"the mesh is not watertight: {consequence}normals are the file's own"]
     elif not of_volume:
-        warnings = [*warnings, "the mesh encloses no volume: the centre of mass is the surface's (--com sets it)"]
+        warnings = [
+            *warnings,
+            "the mesh encloses no volume: the centre of mass is the surface's (--com sets it)",
+        ]
     return Body(mesh, name, sha256, unit, centre, watertight, tuple(warnings))

@@ -1,12 +1,14 @@
 """Built-in objects: closed surfaces of everyday size in metres, made here and the same on every machine.
 
-Most are surfaces of revolution about z, ``(r(s) cos phi, r(s) sin phi, z(s))``. The mug is one as well, with two windows
-cut into its outer wall and a tube swept from one to the other: a single surface with a cavity and a handle.
+Most are surfaces of revolution about z, ``(r(s) cos phi, r(s) sin phi, z(s))``. The mug is one as well,
+with two windows cut into its outer wall and a tube swept from one to the other: a single surface with a
+cavity and a handle.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import trimesh
@@ -19,10 +21,10 @@ Mesh = tuple[np.ndarray, np.ndarray]  # vertices (n, 3) in m, faces (f, 3)
 
 
 def _refine(profile: list[tuple[float, float]], step: float) -> np.ndarray:
-    """The polyline through ``profile`` with no segment longer than ``step``; its corners stay where they are."""
+    """The polyline through ``profile`` with no segment longer than ``step``; its corners stay."""
     points = np.asarray(profile, float)
     pieces = [points[:1]]
-    for start, end in zip(points[:-1], points[1:], strict=True):
+    for start, end in pairwise(points):
         count = max(1, int(np.ceil(np.linalg.norm(end - start) / step - 1e-9)))
         pieces.append(start + (end - start) * (np.arange(1, count + 1) / count)[:, None])
     return np.concatenate(pieces)
@@ -113,7 +115,7 @@ def mug() -> Mesh:
     profile = np.asarray(outer + wall + inner + floor)
     wall_start = 1  # ring at (radius, 0); ring wall_start + j is at height j / rows
 
-    # The windows: `window` rows of cells, 2 * half_width columns about phi = 0, in mirror image about mid-height.
+    # The windows: `window` rows of cells, 2 * half_width columns about phi = 0, mirrored about mid-height.
     upper = wall_start + 17
     lower = wall_start + rows - 17 - window
     kept = np.ones((len(profile) - 3, sections), bool)
@@ -121,7 +123,7 @@ def mug() -> Mesh:
         kept[first : first + window, np.arange(-half_width, half_width)] = False
     vertices, faces = _revolve(profile, sections, kept)
 
-    # The window's edge, anticlockwise seen from +x, as (column, row) steps; one vertex of every tube section each.
+    # The window's edge, anticlockwise from +x, as (column, row) steps; one vertex of every tube section each.
     right, top = [(i, 0) for i in range(-half_width, half_width)], [(half_width, j) for j in range(window)]
     left = [(i, window) for i in range(half_width, -half_width, -1)]
     edge = np.asarray(right + top + left + [(-half_width, j) for j in range(window, 0, -1)])
@@ -141,7 +143,9 @@ def mug() -> Mesh:
     return np.concatenate([vertices, tube.reshape(-1, 3)]), np.concatenate([faces, _bands(index)])
 
 
-OBJECTS: dict[str, Callable[[], Mesh]] = {f.__name__: f for f in (bottle, bowl, box, cylinder, mug, sphere, torus)}
+OBJECTS: dict[str, Callable[[], Mesh]] = {
+    f.__name__: f for f in (bottle, bowl, box, cylinder, mug, sphere, torus)
+}
 
 
 def make(name: str) -> trimesh.Trimesh:

@@ -1,8 +1,8 @@
 """Nearest hits of many rays with a triangle mesh: ``o + t d`` with the smallest t > t_min.
 
-A tree of bounding boxes over the triangles in Morton order, four children a node, walked for all rays at once in
-float64. (trimesh's ray casts take 3 ms a ray on a scanned mesh; this takes 10 to 20 us.)
-Sources: Möller, Trumbore, Fast, minimum storage ray-triangle intersection, 1997; Williams et al., An efficient and
+A tree of bounding boxes over the triangles in Morton order, four children a node, walked for all rays at
+once in float64. (trimesh's ray casts take 3 ms a ray on a scanned mesh; this takes 10 to 20 us.) Sources:
+Möller, Trumbore, Fast, minimum storage ray-triangle intersection, 1997; Williams et al., An efficient and
 robust ray-box intersection algorithm, 2005.
 """
 
@@ -55,7 +55,9 @@ class RayCaster:
         low, high = np.full((slots, 3), np.nan), np.full((slots, 3), np.nan)  # an empty box is never crossed
         low[:count], high[:count] = triangles[order].min(axis=1), triangles[order].max(axis=1)
         slack = 1e-11 * diagonal  # covers the rounding of the box test
-        self.levels: list[list[np.ndarray]] = []  # per level x, y, z: [low; high] of FANOUT siblings a row, from the top
+        self.levels: list[
+            list[np.ndarray]
+        ] = []  # per level x, y, z: [low; high] of FANOUT siblings a row, from the top
         for _ in range(depth):
             low = np.fmin.reduce(low.reshape(-1, FANOUT, 3), axis=1)
             high = np.fmax.reduce(high.reshape(-1, FANOUT, 3), axis=1)
@@ -109,7 +111,7 @@ class RayCaster:
         return nearest, which
 
     def _triangles(self, origin, direction, slot) -> np.ndarray:
-        """t of each ray with the triangle in ``slot``, NaN where they miss. Edges belong to both triangles."""
+        """t of each ray with its triangle, NaN where it misses. Edges belong to both triangles."""
         edge_1, edge_2 = self.edge_1.take(slot, axis=1), self.edge_2.take(slot, axis=1)
         p = _cross(direction, edge_2)
         s = origin - self.corner.take(slot, axis=1)

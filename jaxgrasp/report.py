@@ -1,7 +1,8 @@
 """One grasp's verdict in words, and as a picture.
 
-An escape twist (v; omega) at the centre of mass c is a screw: the line through ``c + omega x v / |omega|^2`` along omega, with
-pitch ``omega . v / |omega|^2`` metres a radian; with omega = 0 it is a slide along v.
+An escape twist (v; omega) at the centre of mass c is a screw: the line through ``c + omega x v /
+|omega|^2`` along omega, with pitch ``omega . v / |omega|^2`` metres a radian; with omega = 0 it is a slide
+along v.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class Screw:
 
 @dataclass(frozen=True)
 class Verdict:
-    """One grasp and its answer, mesh frame, as stored in a file. Forces (k, n) or None; twist (6,) or None."""
+    """One grasp and its answer, mesh frame, as in a file. Forces (k, n) or None; twist (6,) or None."""
 
     position: np.ndarray
     normal: np.ndarray
@@ -71,7 +72,9 @@ class Verdict:
             com, kind = np.asarray(metadata["centre_of_mass"], float), metadata["model"]["kind"]
             names = COMPONENTS[kind]
         except (KeyError, TypeError) as error:
-            raise UserError("the file's metadata lack the centre of mass or the model; screen it again") from error
+            raise UserError(
+                "the file's metadata lack the centre of mass or the model; screen it again"
+            ) from error
         force = row["internal_force"]
         position = np.asarray(row["position"], float).reshape(-1, 3)
         return cls(
@@ -98,7 +101,7 @@ class Verdict:
 
 
 def screw(twist: np.ndarray, centre_of_mass: np.ndarray, size: float) -> Screw:
-    """The motion that ``twist`` (v; omega) at the centre of mass is; ``size`` in m weighs turning against sliding."""
+    """The motion that ``twist`` (v; omega) at the centre of mass is; ``size`` in m weighs omega against v."""
     v, omega = twist[:3], twist[3:]
     turning, sliding = size * np.linalg.norm(omega), np.linalg.norm(v)
     if turning <= SMALL * sliding:
@@ -125,7 +128,11 @@ def _escape(verdict: Verdict) -> list[str]:
             text += f", advancing {1000 * motion.pitch * np.pi / 180:.3g} mm along it with each degree"
         offset = float(np.linalg.norm(motion.point - verdict.centre_of_mass))
         near = offset <= 1e-6 * verdict.size
-        text += " (the axis passes through the centre of mass)" if near else f" ({1000 * offset:.3g} mm from the centre of mass)"
+        text += (
+            " (the axis passes through the centre of mass)"
+            if near
+            else f" ({1000 * offset:.3g} mm from the centre of mass)"
+        )
     lines = [f"The object escapes by {text}."]
     r = verdict.position - verdict.centre_of_mass
     velocity = verdict.twist[:3] + np.cross(verdict.twist[3:], r)
@@ -136,20 +143,28 @@ def _escape(verdict: Verdict) -> list[str]:
         speed = np.hypot(away, across)
         spin = float(verdict.twist[3:] @ n)
         if speed * (1 + SMALL) <= SMALL * verdict.size * np.linalg.norm(verdict.twist[3:]) or speed == 0:
-            told = "the surface stands still" if abs(spin) * verdict.size < SMALL else "the surface only spins on the finger"
+            told = (
+                "the surface stands still"
+                if abs(spin) * verdict.size < SMALL
+                else "the surface only spins on the finger"
+            )
         else:
             told = f"the surface draws away at {np.degrees(np.arctan2(away, across)):.1f} degrees to itself"
             if away <= SMALL * speed:
                 told = "the surface only slides along the finger"
         needed = f"{np.degrees(np.arctan(verdict.friction[i])):.1f}"
-        lines.append(f"  contact {i}: {told}" + (f"; friction holds up to {needed} degrees" if speed > 0 else "") + ".")
+        lines.append(
+            f"  contact {i}: {told}" + (f"; friction holds up to {needed} degrees" if speed > 0 else "") + "."
+        )
     return lines
 
 
 def _forces(verdict: Verdict) -> list[str]:
     assert verdict.force is not None
     names = COMPONENTS[verdict.model]
-    lines = ["Internal forces that balance (mean normal force 1 N; friction as a share of what the cone allows):"]
+    lines = [
+        "Internal forces that balance (mean normal force 1 N; friction as a share of what the cone allows):"
+    ]
     for i in np.flatnonzero(verdict.active):
         part = dict(zip(names, verdict.force[i], strict=True))
         f_n, tangential = part["f_n"], float(np.hypot(part.get("f_x", 0.0), part.get("f_y", 0.0)))
@@ -173,12 +188,14 @@ def explain(verdict: Verdict) -> str:
     if verdict.status is Status.INVALID:
         return "\n".join([*lines, *_faults(verdict)])
     if np.isneginf(verdict.margin):
-        lines.append("Margin: -inf: no internal force presses on any contact, so the fingers cannot squeeze at all.")
+        lines.append(
+            "Margin: -inf: no internal force presses on any contact, so the fingers cannot squeeze at all."
+        )
     else:
         top = verdict.margin + verdict.gap
         lines.append(
-            f"Margin: between {verdict.margin:.6g} and {top:.6g} (1 is the best there is: equal normal forces and no "
-            "friction needed; 0 or below is no grip)."
+            f"Margin: between {verdict.margin:.6g} and {top:.6g} (1 is the best there is: equal normal "
+            "forces and no friction needed; 0 or below is no grip)."
         )
     if verdict.rank is not None and verdict.rank < 6:
         lines.append(
@@ -186,7 +203,7 @@ def explain(verdict: Verdict) -> str:
             "another finger, friction or torsion would help."
         )
     elif verdict.rank is not None:
-        lines.append("Rank: 6 of 6: the contacts can apply a wrench in every direction, if only they may push and pull.")
+        lines.append("Rank: 6 of 6: contacts that could push and pull would balance every load.")
     if verdict.force is not None and verdict.status is not Status.NOT_RESISTANT:
         lines += _forces(verdict)
     if verdict.twist is not None:
@@ -209,7 +226,7 @@ def _faults(verdict: Verdict) -> list[str]:
 
 
 def reprove(verdict: Verdict, metadata: dict[str, Any]) -> str:
-    """One sentence: whether the stored evidence, checked again in float64 without the solver, proves the verdict."""
+    """One sentence: does the stored evidence, checked in float64 without the solver, prove the verdict?"""
     dtype, zero = np.dtype(metadata.get("dtype", "float64")), np.zeros(1)
     with precision(dtype.name):
         model = MODELS[verdict.model]().with_coefficients(
@@ -217,7 +234,11 @@ def reprove(verdict: Verdict, metadata: dict[str, Any]) -> str:
         )
         position = (verdict.position - verdict.centre_of_mass).astype(dtype)
         grasp = Grasp(position, verdict.normal.astype(dtype), model, verdict.active)
-        force = np.zeros(verdict.active.size * model.force_size(3)) if verdict.force is None else verdict.force.ravel()
+        force = (
+            np.zeros(verdict.active.size * model.force_size(3))
+            if verdict.force is None
+            else verdict.force.ravel()
+        )
         evidence = SimpleNamespace(
             status=np.asarray(verdict.status.value),
             internal_force=force,
@@ -225,13 +246,24 @@ def reprove(verdict: Verdict, metadata: dict[str, Any]) -> str:
         )
         proved = bool(check_certificate(grasp, evidence, metadata.get("tolerance", 1e-8)))
     if verdict.status in (Status.UNDECIDED, Status.INVALID):
-        return "There is nothing to prove." if proved else "Checked again: the stored numbers do not fit this verdict."
-    return "Checked again in float64: the proof holds." if proved else "Checked again: the stored evidence does NOT prove it."
+        return (
+            "There is nothing to prove."
+            if proved
+            else "Checked again: the stored numbers do not fit this verdict."
+        )
+    return (
+        "Checked again in float64: the proof holds."
+        if proved
+        else "Checked again: the stored evidence does NOT prove it."
+    )
 
 
 def draw(verdict: Verdict, path: Path, mesh: trimesh.Trimesh | None = None) -> None:
-    """A picture of the grasp: object, contacts, friction cones, forces; and the object moved along its escape."""
+    """A picture: object, contacts, friction cones, forces; and the object moved along its escape."""
     from .drawing import picture  # matplotlib, only where it is asked for
+
+    if verdict.status is Status.INVALID:
+        raise UserError("an invalid grasp has no picture; jaxgrasp explain says what is wrong with it")
 
     motion = None if verdict.twist is None else screw(verdict.twist, verdict.centre_of_mass, verdict.size)
     picture(verdict, motion, path, mesh)

@@ -1,9 +1,10 @@
-"""A run: everything a screening needs, put together from what the user asked for, checked before any work starts."""
+"""A run: everything a screening needs, put together from a request and checked before any work."""
 
 from __future__ import annotations
 
 import hashlib
 import platform
+import shlex
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -71,7 +72,9 @@ class Run:
     metadata: dict[str, Any]
     warnings: tuple[str, ...]
     source: SurfaceSampler | AntipodalSampler | ContactFile
-    override: frozenset[str] = field(default_factory=frozenset)  # coefficients that beat those in a contact file
+    override: frozenset[str] = field(
+        default_factory=frozenset
+    )  # coefficients that beat those in a contact file
 
     def chunks(self) -> Iterator[tuple[int, int, Callable[[], Contacts]]]:
         """First and last + 1 candidate of each chunk, and what loads it: call it in a worker."""
@@ -91,7 +94,7 @@ class Run:
         return Contacts(np.arange(start, stop), position, normal)
 
     def coefficients(self, contacts: Contacts) -> tuple[np.ndarray, np.ndarray]:
-        """mu and gamma (n, k) of these contacts: the file's where it has them, unless the user said otherwise."""
+        """mu and gamma (n, k): the file's where it has them, unless the user said otherwise."""
         shape = contacts.position.shape[:2]
         friction, torsion = np.full(shape, self.friction), np.full(shape, self.torsion)
         if contacts.friction is not None and self.kind != "frictionless" and "friction" not in self.override:
@@ -104,11 +107,6 @@ class Run:
     def model(self) -> ContactModel:
         """The contact model, with no coefficients of its own yet."""
         return MODELS[self.kind]()
-
-    @property
-    def components(self) -> int:
-        """n, force components of a contact."""
-        return self.model.force_size(3)
 
 
 def coefficients(kind: str, friction: float | None, torsion: float | None) -> tuple[float, float]:
@@ -128,7 +126,7 @@ def coefficients(kind: str, friction: float | None, torsion: float | None) -> tu
 
 
 def prepare(request: Request) -> Run:
-    """Check the request, read its object and make the sampler. Raises UserError with one line saying what to do."""
+    """Check the request, read its object, make the sampler. UserError: one line saying what to do."""
     if request.dtype not in ("float64", "float32"):
         raise UserError(f"unknown dtype {request.dtype!r}; take float64 or float32")
     if request.unit not in meshes.METRES_PER:
@@ -186,7 +184,9 @@ def _from_mesh(request: Request) -> Run:
         "seed": request.seed,
     }
     model = (kind, friction, torsion)
-    return _run(request, source, samples, fingers, model, body.centre_of_mass, body.unit, about, body.warnings)
+    return _run(
+        request, source, samples, fingers, model, body.centre_of_mass, body.unit, about, body.warnings
+    )
 
 
 def _from_contacts(request: Request) -> Run:
@@ -218,7 +218,16 @@ def _from_contacts(request: Request) -> Run:
     override = frozenset(name for name, value in said.items() if value is not None)
     centre = np.asarray(com, np.float64)
     return _run(
-        request, source, source.rows, source.fingers, model, centre, known.get("unit", "m"), about, (), override
+        request,
+        source,
+        source.rows,
+        source.fingers,
+        model,
+        centre,
+        known.get("unit", "m"),
+        about,
+        (),
+        override,
     )
 
 
@@ -257,7 +266,7 @@ def _run(
         "tolerance": request.tolerance,
         "verdict_only": request.verdict_only,
         "filter": request.filter,
-        "command": " ".join(words),
+        "command": shlex.join(words),
         "backend": jax.default_backend(),
         "versions": {
             "jaxgrasp": __version__,

@@ -1,9 +1,10 @@
 """Screening: candidates in, verdicts out, in chunks: memory does not grow with their number.
 
-A chunk is sampled (or read), solved and written to a shard, ``OUTPUT.parts/00000000.arrow`` and so on, each written
-beside and renamed. When all are there they become the row groups of one Parquet file, in order, which is renamed to
-OUTPUT. (Shards are Arrow files with the Parquet file's columns: a quarter of the time to write and read.) Shards say which run they belong to, so a killed run goes on where it was; its rows are those of an uninterrupted one, because
-a row depends on the seed and its number alone.
+A chunk is sampled (or read), solved and written to a shard, ``OUTPUT.parts/00000000.arrow`` and so on, each
+written beside and renamed. When all are there they become the row groups of one Parquet file, in order,
+which is renamed to OUTPUT. (Shards are Arrow files with the Parquet file's columns: a quarter of the time
+to write and read.) Shards say which run they belong to, so a killed run goes on where it was; its rows are
+those of an uninterrupted one, because a row depends on the seed and its number alone.
 """
 
 from __future__ import annotations
@@ -44,8 +45,8 @@ def screen(run: Run, resume: bool = False, progress: Callable[[Summary], None] |
     resume    go on with an unfinished run of the same options
     progress  called with the running summary after every chunk
 
-    Raises UserError where the output cannot be written or belongs to another run. KeyboardInterrupt leaves the finished
-    shards for ``resume``.
+    Raises UserError where the output cannot be written or belongs to another run. KeyboardInterrupt leaves
+    the finished shards for ``resume``.
     """
     parts = run.output.with_name(run.output.name + ".parts")
     fingerprint = dump(run.metadata)
@@ -55,7 +56,9 @@ def screen(run: Run, resume: bool = False, progress: Callable[[Summary], None] |
     try:
         with precision(run.dtype):
             summary = _chunks(run, parts, fingerprint, progress or (lambda _: None))
+        started = time.perf_counter()
         _assemble(run, parts, summary)
+        summary.seconds += time.perf_counter() - started
     except OSError as error:
         raise UserError(f"cannot write to {parts}: {error.strerror or error}") from error
     finally:
@@ -75,7 +78,9 @@ def _claim(output: Path, parts: Path, fingerprint: bytes, resume: bool) -> None:
         if not resume:
             raise UserError(f"{parts} holds an unfinished run: go on with --resume, or delete that directory")
         if identity.read_bytes() != fingerprint:
-            raise UserError(f"{parts} belongs to another run: {_difference(identity.read_bytes(), fingerprint)}")
+            raise UserError(
+                f"{parts} belongs to another run: {_difference(identity.read_bytes(), fingerprint)}"
+            )
     try:
         parts.mkdir(exist_ok=True)
         for leftover in parts.glob(".*.tmp"):
@@ -86,7 +91,9 @@ def _claim(output: Path, parts: Path, fingerprint: bytes, resume: bool) -> None:
         if output.exists() and not os.access(output, os.W_OK):
             raise PermissionError(13, "Permission denied")
     except OSError as error:
-        raise UserError(f"{output} cannot be written: {error.strerror or error}; name another file with -o") from error
+        raise UserError(
+            f"{output} cannot be written: {error.strerror or error}; name another file with -o"
+        ) from error
 
 
 def _difference(there: bytes, here: bytes) -> str:
@@ -114,10 +121,21 @@ def _compiled(rows: int, k: int, kind: str, dtype: str, tolerance: float, verdic
     return jax.jit(solve).lower(*(jax.ShapeDtypeStruct(*s) for s in shapes)).compile(), shapes
 
 
+def _lanes(rows: int) -> int:
+    """Lanes to compile for: few different numbers, so that one process seldom compiles twice."""
+    return max(256, 1 << (rows - 1).bit_length()) if rows <= 16384 else -(-rows // 16384) * 16384
+
+
 def _solver(run: Run) -> Callable[[Contacts], tuple[Verdicts, float]]:
-    """Compiled once for chunks of one size; shorter chunks are padded with inactive lanes, which end at once."""
-    rows = min(run.chunk, run.candidates)
-    compiled, shapes = _compiled(rows, run.fingers, run.kind, run.dtype, run.tolerance, run.verdict_only)
+    """Compiled once for chunks of one size; padding is inactive lanes, which end at once."""
+    compiled, shapes = _compiled(
+        _lanes(min(run.chunk, run.candidates)),
+        run.fingers,
+        run.kind,
+        run.dtype,
+        run.tolerance,
+        run.verdict_only,
+    )
 
     def call(contacts: Contacts) -> tuple[Verdicts, float]:
         # What is stored is what is solved: round to the file's dtype first, then move to the centre of mass.
@@ -132,14 +150,16 @@ def _solver(run: Run) -> Callable[[Contacts], tuple[Verdicts, float]]:
         found = jax.block_until_ready(compiled(*padded))
         seconds = time.perf_counter() - start
         names = Verdicts.__dataclass_fields__
-        return Verdicts(**{name: np.asarray(getattr(found, name))[: len(contacts)] for name in names}), seconds
+        return Verdicts(
+            **{name: np.asarray(getattr(found, name))[: len(contacts)] for name in names}
+        ), seconds
 
     return call
 
 
 def _chunks(run: Run, parts: Path, fingerprint: bytes, progress: Callable[[Summary], None]) -> Summary:
     total = Summary(run.candidates)
-    kind = schema(run.fingers, run.components, run.dtype, run.metadata)
+    kind = schema(run.fingers, run.dtype, run.metadata)
     started = time.perf_counter()
     solver: Callable[[Contacts], tuple[Verdicts, float]] | None = None
     pending: deque[Future[Summary]] = deque()
@@ -184,20 +204,20 @@ def _one(run: Run, solver, contacts: Contacts, path: Path, kind: pa.Schema, stop
     """Filter, solve and write one chunk."""
     real = np.dtype(run.dtype)
     shape = contacts.position.shape[:2]
-    friction, torsion = run.coefficients(contacts)
+    friction, torsion = (values.astype(real) for values in run.coefficients(contacts))
     active = np.ones(shape, bool) if contacts.active is None else contacts.active
     contacts = Contacts(
         contacts.grasp_id,
         contacts.position.astype(real),
         contacts.normal.astype(real),
-        friction.astype(real),
-        torsion.astype(real),
+        friction,
+        torsion,
         active,
     )
     removed: dict[str, int] = {}
     offered = len(contacts)
     if run.filter:
-        reasons = geometric_filter(contacts.position, contacts.normal, contacts.friction, active)
+        reasons = geometric_filter(contacts.position, contacts.normal, friction, active)
         removed = {reason: int(rows.sum()) for reason, rows in reasons.items()}
         kept = ~np.any(list(reasons.values()), axis=0)
         contacts = Contacts(*(getattr(contacts, name)[kept] for name in Contacts.__dataclass_fields__))
@@ -215,7 +235,10 @@ def _write_shard(path: Path, rows: pa.Table) -> None:
     beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         options = pa.ipc.IpcWriteOptions(compression="lz4")
-        with pa.OSFile(str(beside), "wb") as sink, pa.ipc.new_file(sink, rows.schema, options=options) as writer:
+        with (
+            pa.OSFile(str(beside), "wb") as sink,
+            pa.ipc.new_file(sink, rows.schema, options=options) as writer,
+        ):
             writer.write_table(rows)
         os.replace(beside, path)
     finally:
@@ -251,8 +274,13 @@ def _shards(parts: Path) -> Iterator[pa.Table]:
 
 def _assemble(run: Run, parts: Path, summary: Summary) -> None:
     metadata: dict[str, Any] = {**run.metadata, **({"removed": summary.removed} if run.filter else {})}
-    kind = schema(run.fingers, run.components, run.dtype, metadata)
-    write(run.output, (rows.replace_schema_metadata(kind.metadata) for rows in _shards(parts)), kind, folder=parts)
+    kind = schema(run.fingers, run.dtype, metadata)
+    write(
+        run.output,
+        (rows.replace_schema_metadata(kind.metadata) for rows in _shards(parts)),
+        kind,
+        folder=parts,
+    )
     shutil.rmtree(parts)
 
 
@@ -266,7 +294,9 @@ def _finished(run: Run, fingerprint: bytes) -> Summary | None:
                 return None
             summary = Summary(run.candidates)
             for batch in file.iter_batches(1 << 20, columns=["status", "margin"]):
-                summary.add(Summary.of(batch["status"].to_numpy(), batch["margin"].to_numpy(zero_copy_only=False)))
+                summary.add(
+                    Summary.of(batch["status"].to_numpy(), batch["margin"].to_numpy(zero_copy_only=False))
+                )
     except (OSError, pa.ArrowException, ValueError, KeyError):
         return None
     summary.add(Summary(removed=removed))

@@ -1,7 +1,8 @@
 """Counts and margins of many verdicts in a size that does not depend on how many they are.
 
-Quantiles come from a histogram over ``u = s / (1 + s)``, s = 1 - margin >= 0, in ``BINS`` equal steps: a quantile is right to
-``(1 + s)^2 / (2 BINS)``, 3e-5 at margin 0. Histograms add up, so the order of chunks does not matter.
+Quantiles come from a histogram over ``u = s / (1 + s)``, s = 1 - margin >= 0, in ``BINS`` equal steps: a
+quantile is right to ``(1 + s)^2 / (2 BINS)``, 3e-5 at margin 0. Histograms add up, so the order of chunks
+does not matter.
 """
 
 from __future__ import annotations
@@ -52,9 +53,10 @@ class Summary:
 
     def add(self, other: Summary) -> None:
         """Take the rows of ``other`` in as well."""
-        for mine, theirs in ((self.counts, other.counts), (self.removed, other.removed)):
-            for name, number in theirs.items():
-                mine[name] = mine.get(name, 0) + number
+        for status, number in other.counts.items():
+            self.counts[status] = self.counts.get(status, 0) + number
+        for reason, number in other.removed.items():
+            self.removed[reason] = self.removed.get(reason, 0) + number
         self.histogram = self.histogram + other.histogram
         self.solved += other.solved
         self.solve_seconds += other.solve_seconds

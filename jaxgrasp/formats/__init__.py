@@ -1,0 +1,1 @@
+"""Grasp sets in and out, one file a format."""
