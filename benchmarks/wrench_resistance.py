@@ -2,11 +2,11 @@
 
     python benchmarks/wrench_resistance.py [--json FILE] [--grasps 8192] [--repeats 7] [--contacts 2 3 4 8]
 
-One process pinned to one core, single-threaded. Every solver gets the same random grasps (hard fingers on a sphere with
-tilted normals, mu in [0.3, 0.8]) and works to 1e-8. The baselines solve the dual form of the margin problem, six
-unknowns and k second-order cones of size 3, which is the form that suits them best; their matrices are built beforehand,
-ours are built from positions and normals inside the measured time. Times are medians over repeats that take turns;
-compile and construction times stand apart. No test asserts a time.
+One process pinned to one core, single-threaded. Every solver gets the same random grasps (hard fingers on a sphere
+with tilted normals, mu in [0.3, 0.8]) and works to 1e-8. The baselines solve the dual form of the margin problem,
+six unknowns and k second-order cones of size 3, which is the form that suits them best; their matrices are built
+beforehand, ours are built from positions and normals inside the measured time. Times are medians over repeats that
+take turns; compile and construction times stand apart. No test asserts a time.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 if hasattr(os, "sched_setaffinity"):
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
+import importlib  # noqa: E402
 import importlib.metadata  # noqa: E402
+from typing import Any  # noqa: E402
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
@@ -65,7 +67,7 @@ class Ours:
         self.name, self.grasp, self.options = name, grasp, options
         self.count = grasp.position.shape[0]
         start = time.perf_counter()
-        self.run()
+        self.result = jg.wrench_resistance(grasp, TOLERANCE, **options)
         self.preparation = time.perf_counter() - start
 
     def run(self) -> None:
@@ -79,7 +81,8 @@ class Ours:
         wrong = (yes & (reference < -1e-7)) | (no & ~deficient & (reference > 1e-7))
         entry = {
             "iterations": float(iterations.mean()),
-            "undecided": int((~yes & ~no).sum()),
+            "marginal": int((status == jg.Status.MARGINAL).sum()),
+            "undecided": int((status == jg.Status.UNDECIDED).sum()),
             "contradictions": int(wrong.sum()),
             "certified": float(jg.check_certificate(self.grasp, res).mean()),
         }
@@ -95,7 +98,7 @@ class Moreau:
     name = "moreau (batched)"
 
     def __init__(self, program, k: int):
-        import moreau
+        moreau: Any = importlib.import_module("moreau")
 
         self.a, matrix, c = program
         self.count = len(self.a)
@@ -138,8 +141,8 @@ class Clarabel:
     name = "clarabel"
 
     def __init__(self, program, k: int, count: int):
-        import clarabel
-        from scipy.sparse import csc_matrix
+        clarabel: Any = importlib.import_module("clarabel")
+        csc_matrix: Any = importlib.import_module("scipy.sparse").csc_matrix
 
         self.clarabel = clarabel
         self.a, matrix, self.c = program
@@ -178,7 +181,9 @@ def measure(k: int, count: int, repeats: int, seed: int) -> dict[str, dict]:
     """All solvers on the same grasps with k contacts; the repeats take turns."""
     position, normal, friction = random_grasps(count, k, seed)
     grasp = jg.Grasp(position, normal, jg.HardFinger(friction))
-    single = jg.Grasp(*(x.astype(np.float32) for x in (position, normal)), jg.HardFinger(friction.astype(np.float32)))
+    single = jg.Grasp(
+        *(x.astype(np.float32) for x in (position, normal)), jg.HardFinger(friction.astype(np.float32))
+    )
     program = dual_program(grasp)
     runners: list = [
         Ours("jaxgrasp float64, gap 1e-8", grasp),
@@ -215,7 +220,11 @@ def hardware() -> dict[str, str]:
     cpu = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():
-        names = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
+        names = [
+            line.split(":")[1].strip()
+            for line in info.read_text().splitlines()
+            if line.startswith("model name")
+        ]
         cpu = names[0] if names else cpu
     versions = {}
     for package in ("jax", "jaxlib", "numpy", "moreau", "clarabel"):
@@ -230,12 +239,16 @@ def show(k: int, rows: dict[str, dict]) -> None:
     """One table a number of contacts; the ratio is Moreau's time over the row's."""
     base = rows.get(Moreau.name, {}).get("microseconds")
     print(f"\nk = {k}")
-    print(f"{'':32s} {'us/grasp':>9s} {'ratio':>7s} {'iter':>5s} {'compile s':>9s} {'open':>5s} {'difference':>11s}")
+    print(
+        f"{'':32s} {'us/grasp':>9s} {'ratio':>7s} {'iter':>5s} {'compile s':>9s} "
+        f"{'t* = 0':>6s} {'open':>5s} {'difference':>11s}"
+    )
     for name, row in rows.items():
         ratio = f"{base / row['microseconds']:7.1f}" if base else "      -"
         difference = f"{row['largest_difference']:11.1e}" if "largest_difference" in row else "          -"
         line = f"{name:32s} {row['microseconds']:9.2f} {ratio} {row['iterations']:5.1f}"
-        line += f" {row['preparation_seconds']:9.2f} {row['undecided']:5d} {difference}"
+        marginal = f"{row['marginal']:6d}" if "marginal" in row else "     -"
+        line += f" {row['preparation_seconds']:9.2f} {marginal} {row['undecided']:5d} {difference}"
         if row.get("contradictions"):
             line += f"  {row['contradictions']} CONTRADICTIONS"
         if row.get("certified", 1.0) < 1:
@@ -244,7 +257,9 @@ def show(k: int, rows: dict[str, dict]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     parser.add_argument("--grasps", type=int, default=8192)
     parser.add_argument("--repeats", type=int, default=7)
@@ -259,7 +274,8 @@ def main() -> None:
         show(k, results[k])
     if options.json:
         beside = options.json.with_suffix(".tmp")
-        beside.write_text(json.dumps({"hardware": machine, "options": vars(options) | {"json": None}, "k": results}, indent=1))
+        settings = vars(options) | {"json": None}
+        beside.write_text(json.dumps({"hardware": machine, "options": settings, "k": results}, indent=1))
         beside.replace(options.json)
         print(f"\nwritten to {options.json}")
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
+import platform
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 from jax.extend.backend import clear_backends
 
-__all__ = ["precision", "usable_backend"]
+__all__ = ["precision", "remember_compilations", "usable_backend"]
 
 
 def usable_backend(say: Callable[[str], None]) -> str:
@@ -37,3 +41,29 @@ def precision(dtype: str) -> Iterator[None]:
         yield
     finally:
         jax.config.update("jax_enable_x64", before)
+
+
+def remember_compilations() -> Path | None:
+    """Keep compiled programs between runs, so that only the first one waits for the compiler; where they are kept.
+
+    They go to ``$XDG_CACHE_HOME/jaxgrasp`` (default ``~/.cache``), apart by processor: a home directory may be shared by
+    machines that do not run each other's code. ``JAX_COMPILATION_CACHE_DIR`` overrides this; set it empty to keep none.
+    """
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ or jax.config.jax_compilation_cache_dir:  # pyright: ignore
+        return None
+    cpuinfo = Path("/proc/cpuinfo")
+    flags = (
+        [line for line in cpuinfo.read_text().splitlines() if line.startswith(("flags", "Features"))][:1]
+        if (cpuinfo.exists())
+        else []
+    )
+    machine = "\n".join([platform.platform(), platform.processor(), jax.__version__, *flags])
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    directory = root / "jaxgrasp" / hashlib.sha256(machine.encode()).hexdigest()[:16]
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None  # a read-only home: compile every time
+    jax.config.update("jax_compilation_cache_dir", str(directory))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+    return directory

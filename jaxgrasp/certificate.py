@@ -35,7 +35,10 @@ def _frame(normal: np.ndarray) -> list[np.ndarray]:
     sign = np.where(z >= 0, 1.0, -1.0)
     a = -1 / (sign + z)
     b = x * y * a
-    return [np.stack([1 + sign * x * x * a, sign * b, -sign * x], -1), np.stack([b, sign + y * y * a, -y], -1)]
+    return [
+        np.stack([1 + sign * x * x * a, sign * b, -sign * x], -1),
+        np.stack([b, sign + y * y * a, -y], -1),
+    ]
 
 
 def _cross(p: np.ndarray, f: np.ndarray) -> np.ndarray:
@@ -101,14 +104,18 @@ def check_certificate(grasp, result, tolerance: float = 1e-8) -> np.ndarray:
         live = active & valid[:, None]
 
         # Lanes and contacts that do not count get harmless numbers.
-        normal = np.where(live[..., None], normal / np.where(size > 0, size, 1.0)[..., None], np.eye(dimension)[-1])
+        normal = np.where(
+            live[..., None], normal / np.where(size > 0, size, 1.0)[..., None], np.eye(dimension)[-1]
+        )
         normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
         position = np.where(live[..., None], position, 0.0)
         friction, torsion = np.where(live, friction, 0.0), np.where(live, torsion, 0.0)
         length = np.max(np.linalg.norm(position, axis=-1), -1)
         length = np.where(length > 0, length, 1.0)
 
-        blocks = _folded(position / length[:, None, None], normal, friction, torsion / length[:, None], components)
+        blocks = _folded(
+            position / length[:, None, None], normal, friction, torsion / length[:, None], components
+        )
         blocks = np.where(live[..., None, None], blocks, 0.0)
         A = np.moveaxis(blocks, 1, 2).reshape(len(blocks), m, k * n)
         values = np.linalg.svd(A, compute_uv=False)
@@ -138,7 +145,9 @@ def check_certificate(grasp, result, tolerance: float = 1e-8) -> np.ndarray:
         depth = x[..., 0] - np.linalg.norm(x[..., 1:], axis=-1)
         escapes = np.min(np.where(live, depth - ROUNDING * EPS * block_norm, np.inf), -1) > 0
         unseen = np.linalg.norm(np.einsum("lij,li->lj", A, xi), axis=-1)
-        rank_deficient = (smallest <= np.maximum(tiny, rank_tiny)) & (unseen <= np.maximum(tiny, 2 * rank_tiny))
+        rank_deficient = (smallest <= np.maximum(tiny, rank_tiny)) & (
+            unseen <= np.maximum(tiny, 2 * rank_tiny)
+        )
         escapes |= rank_deficient
 
         # Both together: t* >= slack - shift, and t* <= 1 + a.y for the multiple of -xi that the dual admits.
@@ -151,7 +160,13 @@ def check_certificate(grasp, result, tolerance: float = 1e-8) -> np.ndarray:
         marginal = full_rank & (lower >= -2 * resolution) & (upper <= 2 * resolution)
 
     accepted = np.select(
-        [status == RESISTANT, status == NOT_RESISTANT, status == MARGINAL, status == UNDECIDED, status == INVALID],
+        [
+            status == RESISTANT,
+            status == NOT_RESISTANT,
+            status == MARGINAL,
+            status == UNDECIDED,
+            status == INVALID,
+        ],
         [valid & resistant, valid & escapes, valid & marginal, valid, ~valid],
         default=False,
     )

@@ -150,7 +150,7 @@ def screen(
         int | None, typer.Option(help="Chunks worked on at a time (default: 2, or 1 on one core).")
     ] = None,
 ) -> None:
-    from .backend import precision, usable_backend
+    from .backend import precision, remember_compilations, usable_backend
     from .run import Request, prepare
     from .screening import screen as start
 
@@ -158,6 +158,7 @@ def screen(
     if threads is not None and threads < 1:
         raise UserError(f"--threads must be at least 1, got {threads}")
     usable_backend(_say)
+    remember_compilations()
     request = Request(
         source, output, fingers, model, friction, torsion, samples, seed, unit, centre, dtype, tolerance,
         verdict_only, sampler, filter, chunk, threads or min(2, os.cpu_count() or 1),

@@ -55,7 +55,7 @@ def padded_rows(rows: Rows, width: int) -> Rows:
     return jax.tree.map(lambda x: jnp.pad(x, [(0, extra)] + [(0, 0)] * (x.ndim - 1)), rows)
 
 
-def map_tiles(kernel: Callable[[Any], Any], rows: Rows, count: Array, width: int) -> Any:
+def map_tiles(kernel: Callable[[Any], Any], rows: Any, count: Array, width: int) -> Any:
     """``kernel`` on the first ``count`` rows, a tile of ``width`` at a time; zeros for the rows beyond.
 
     The number of rows is a multiple of ``width``. The cost follows ``count``, not the number of rows.
@@ -71,9 +71,7 @@ def map_tiles(kernel: Callable[[Any], Any], rows: Rows, count: Array, width: int
     def one_tile(carry: tuple[Array, Any]) -> tuple[Array, Any]:
         start, current = carry
         result = kernel(tile_at(start))
-        updated = jax.tree.map(
-            lambda x, r: lax.dynamic_update_slice_in_dim(x, r, start, 0), current, result
-        )
+        updated = jax.tree.map(lambda x, r: lax.dynamic_update_slice_in_dim(x, r, start, 0), current, result)
         return start + jnp.int32(width), updated
 
     return lax.while_loop(lambda carry: carry[0] < count, one_tile, (jnp.int32(0), out))[1]

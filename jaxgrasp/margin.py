@@ -26,7 +26,16 @@ from .solver.linear import Cholesky, Vector, cholesky, gram, inverse_frobenius, 
 from .solver.linear import solve as solve_factored
 from .solver.stages import stage
 
-__all__ = ["Contacts", "Folded", "Projection", "fold", "margin_program", "project", "starting_point", "upper_bound"]
+__all__ = [
+    "Contacts",
+    "Folded",
+    "Projection",
+    "fold",
+    "margin_program",
+    "project",
+    "starting_point",
+    "upper_bound",
+]
 
 START_DEPTH = 0.3  # how far inside the cones the first forces lie, relative to their tangential size
 
@@ -60,7 +69,9 @@ class Folded(NamedTuple):
 
 
 @stage
-def _screen(position: Array, normal: Array, friction: Array, torsion: Array, active: Array) -> tuple[Array, Array]:
+def _screen(
+    position: Array, normal: Array, friction: Array, torsion: Array, active: Array
+) -> tuple[Array, Array]:
     """Which lanes are grasps, and which of their contacts count. Arrays (k, dim, L) and (k, L)."""
     size = jnp.max(jnp.abs(normal), axis=1)
     usable = jnp.all(jnp.isfinite(position) & jnp.isfinite(normal), axis=1) & (size > 0)
@@ -112,7 +123,11 @@ def _frobenius(columns: Cone) -> Array:
 def fold(contacts: Contacts, components: tuple[Component, ...]) -> Folded:
     """A of a tile of L rows. Contacts that do not count get zero columns; invalid lanes are all zero."""
     position, normal = to_lanes(contacts.position), to_lanes(contacts.normal)
-    friction, torsion, active = to_lanes(contacts.friction), to_lanes(contacts.torsion), to_lanes(contacts.active)
+    friction, torsion, active = (
+        to_lanes(contacts.friction),
+        to_lanes(contacts.torsion),
+        to_lanes(contacts.active),
+    )
     dtype, dimension = position.dtype, position.shape[1]
     valid, live = _screen(position, normal, friction, torsion, active)
     exists = live.astype(dtype)
@@ -290,4 +305,6 @@ def upper_bound(folded: Folded, y: Vector) -> Array:
     for a, b in zip(folded.resultant[1:], y[1:], strict=True):
         descent = descent + a * b
     useful = (descent < 0) & (gauge > 0)
-    return 1 + jnp.where(useful, descent / jnp.where(useful, gauge, jnp.ones_like(gauge)), jnp.zeros_like(gauge))
+    return 1 + jnp.where(
+        useful, descent / jnp.where(useful, gauge, jnp.ones_like(gauge)), jnp.zeros_like(gauge)
+    )

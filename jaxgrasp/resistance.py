@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 from jax.custom_batching import custom_vmap
 
 from ._types import Array, Float, Int, gap_floor, rank_tolerance, rounding_constant, unit_roundoff
@@ -104,7 +105,9 @@ class _Plan(NamedTuple):
 def _room_for_rounding(folded: Folded, sigma: Array) -> Array:
     """The margin from which on ``judge`` will certify a yes; infinite where full rank is not proven."""
     unit = rounding_constant() * unit_roundoff(folded.norm.dtype) * folded.norm * folded.count
-    return jnp.where(sigma > 0, 8 * unit / jnp.where(sigma > 0, sigma, jnp.ones_like(sigma)), jnp.full_like(unit, jnp.inf))
+    return jnp.where(
+        sigma > 0, 8 * unit / jnp.where(sigma > 0, sigma, jnp.ones_like(sigma)), jnp.full_like(unit, jnp.inf)
+    )
 
 
 def _decision(folded: Folded, sigma: Array) -> Callable[[ConeProgram, Iterate], Array]:
@@ -183,7 +186,9 @@ def _rank_kernel(plan: _Plan) -> Callable[[Contacts], _RankRows]:
 
 def _answer_kernel(plan: _Plan) -> Callable[..., Verdict]:
     @kernel
-    def run(contacts: Contacts, rows: _State, unbounded: Array, rank_rows: _RankRows, tolerance: Array) -> Verdict:
+    def run(
+        contacts: Contacts, rows: _State, unbounded: Array, rank_rows: _RankRows, tolerance: Array
+    ) -> Verdict:
         folded = fold(contacts, plan.components)
         projection = project(folded)
         iterate = rows.unpack().iterate
@@ -285,14 +290,18 @@ def _solve_on_host(plan: _Plan, contacts: Contacts, tolerance: Array) -> WrenchR
             chunk.append(part)
         result = _solve_chunk(plan, Contacts(*chunk), jnp.int32(count), tolerance)
         results.append(jax.tree.map(lambda x, c=count: np.asarray(x)[:c], result))
-    joined = jax.tree.map(lambda *parts: np.concatenate(parts) if len(parts) > 1 else parts[0], *results)
+    joined = jax.tree.map(lambda *parts: np.concatenate(parts), *results)
     return jax.tree.map(lambda x: jnp.asarray(x.reshape((*batch, *x.shape[1:]))), joined)
 
 
 def contacts_of(grasp: Grasp) -> Contacts:
     """The arrays the lanes are made of."""
     return Contacts(
-        grasp.position, grasp.normal, grasp.model.friction_coefficient, grasp.model.torsion_coefficient, grasp.active
+        grasp.position,
+        grasp.normal,
+        grasp.model.friction_coefficient,
+        grasp.model.torsion_coefficient,
+        grasp.active,
     )
 
 
@@ -321,7 +330,7 @@ def wrench_resistance(grasp: Grasp, tolerance: float = 1e-8, verdict_only: bool 
     floor = gap_floor(grasp.dtype)
     goal = jnp.maximum(jnp.asarray(tolerance, grasp.dtype), jnp.asarray(floor, grasp.dtype))
     contacts = contacts_of(grasp)
-    traced = any(isinstance(x, jax.core.Tracer) for x in (*contacts, goal))
+    traced = any(isinstance(x, Tracer) for x in (*contacts, goal))
     if traced or jax.default_backend() != "cpu":
         return _batched(plan)(contacts, goal)
     return _solve_on_host(plan, contacts, goal)

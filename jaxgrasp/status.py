@@ -23,9 +23,15 @@ class Status(IntEnum):
 
     RESISTANT = 1, "Wrench resistant (force closure): the internal force proves it."
     NOT_RESISTANT = 2, "Not wrench resistant: the escape twist is a motion no finger force can oppose."
-    MARGINAL = 3, "Marginal: the margin is zero to within the tolerance, so any disturbance may break the grasp."
+    MARGINAL = (
+        3,
+        "Marginal: the margin is zero to within the tolerance, so any disturbance may break the grasp.",
+    )
     UNDECIDED = 4, "Undecided: the solver stopped before it had a proof either way."
-    INVALID = 5, (
-        "Invalid: the numbers are not a grasp (NaN or infinite entry, zero-length normal, negative friction, "
-        "or no active contact)."
+    INVALID = (
+        5,
+        (
+            "Invalid: the numbers are not a grasp (NaN or infinite entry, zero-length normal, negative friction, "
+            "or no active contact)."
+        ),
     )

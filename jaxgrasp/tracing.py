@@ -64,7 +64,9 @@ def trace(grasp: Grasp, tolerance: float = 1e-8, max_iterations: int = TOTAL_BUD
     ``grasp`` must be a single grasp (no batch axes): index a batch first, ``trace(grasps[17])``.
     """
     if grasp.batch_shape:
-        raise ValueError(f"trace takes one grasp; index the batch {grasp.batch_shape} first, e.g. trace(grasp[0])")
+        raise ValueError(
+            f"trace takes one grasp; index the batch {grasp.batch_shape} first, e.g. trace(grasp[0])"
+        )
     components = grasp.model.components(grasp.dimension)
     rows = jax.tree.map(lambda x: x[None], contacts_of(grasp))
     goal = jnp.asarray(max(tolerance, gap_floor(grasp.dtype)), grasp.dtype)

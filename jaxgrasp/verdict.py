@@ -166,4 +166,3 @@ def judge(
         return jnp.where(folded.valid, x, nan)
 
     return Verdict(status, valid(margin), valid(gap), valid(count), valid(force), valid(twist))
-

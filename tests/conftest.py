@@ -1,8 +1,11 @@
 """Test session set-up: CPU, dtype, strict promotion."""
 
 import os
+import tempfile
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# The command line keeps compiled programs; the tests keep theirs out of the user's home.
+os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="jaxgrasp-cache-")
 
 import jax
 import pytest

@@ -32,7 +32,10 @@ def random_contacts(rng: np.random.Generator, grasps: int, k: int, dimension: in
         elif name == "box":
             count = int(here.sum())
             q, n = rng.uniform(-1, 1, (count, k, dimension)), np.zeros((count, k, dimension))
-            axis, side = rng.integers(dimension, size=(count, k, 1)), rng.choice([-1.0, 1.0], size=(count, k, 1))
+            axis, side = (
+                rng.integers(dimension, size=(count, k, 1)),
+                rng.choice([-1.0, 1.0], size=(count, k, 1)),
+            )
             np.put_along_axis(q, axis, side, -1)
             np.put_along_axis(n, axis, -side, -1)
             position[here], normal[here] = q, n

@@ -87,7 +87,9 @@ def test_a_rank_claim_needs_a_rank_deficient_map(solved):
 def test_scale_and_batch_of_the_proof_do_not_matter(solved):
     grasp, res = solved
     scaled = replaced(
-        res, internal_force=1e3 * np.asarray(res.internal_force), escape_twist=1e-3 * np.asarray(res.escape_twist)
+        res,
+        internal_force=1e3 * np.asarray(res.internal_force),
+        escape_twist=1e-3 * np.asarray(res.escape_twist),
     )
     assert jg.check_certificate(grasp, scaled).all()
     one = jg.check_certificate(grasp[4], jg.wrench_resistance(grasp[4]))
@@ -100,6 +102,9 @@ def test_imports_nothing_of_ours():
     import pathlib
 
     tree = ast.parse(pathlib.Path(jg.certificate.__file__).read_text())
-    names = [n.names[0].name if isinstance(n, ast.Import) else n.module for n in ast.walk(tree)
-             if isinstance(n, ast.Import | ast.ImportFrom)]
+    names = [
+        n.names[0].name if isinstance(n, ast.Import) else n.module
+        for n in ast.walk(tree)
+        if isinstance(n, ast.Import | ast.ImportFrom)
+    ]
     assert set(names) == {"__future__", "numpy"}

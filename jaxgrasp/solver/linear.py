@@ -37,7 +37,9 @@ def _schur_column(column: Array, previous: list[tuple[Array, Array]]) -> Array:
 def _inverse_pivot(pivot: Array, threshold: Array) -> Array:
     # A dependent row gets a zero, which solves consistent singular systems and touches nothing else.
     positive = pivot > threshold
-    return jnp.where(positive, lax.rsqrt(jnp.where(positive, pivot, jnp.ones_like(pivot))), jnp.zeros_like(pivot))
+    return jnp.where(
+        positive, lax.rsqrt(jnp.where(positive, pivot, jnp.ones_like(pivot))), jnp.zeros_like(pivot)
+    )
 
 
 @stage
@@ -66,7 +68,9 @@ def cholesky(M: tuple[Array, ...], tolerance: float) -> Cholesky:
     for j, lower in enumerate(M):
         previous = [(columns[q][j - q :], columns[q][j - q]) for q in range(j)]
         column = _schur_column(lower, previous) if previous else lower
-        inverse.append(_inverse_pivot(column[0], jnp.maximum(lower[0] * jnp.asarray(tolerance, dtype), floor)))
+        inverse.append(
+            _inverse_pivot(column[0], jnp.maximum(lower[0] * jnp.asarray(tolerance, dtype), floor))
+        )
         columns.append(_scaled(column, inverse[-1]))
     return Cholesky(tuple(columns), tuple(inverse))
 

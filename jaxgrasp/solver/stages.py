@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+from jax.core import eval_jaxpr
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.interpreters import partial_eval
 
@@ -39,7 +40,7 @@ def _called(function: Callable, attributes: dict[str, str]) -> Callable:
         inputs = [x for x, keep in zip(jax.tree.leaves(args), used, strict=True) if keep]
 
         def body(*values: Any) -> Any:
-            return jax.core.eval_jaxpr(live, closed.consts, *values)
+            return eval_jaxpr(live, closed.consts, *values)
 
         body.__name__ = getattr(function, "__name__", "stage").strip("_")
         outer = jax.make_jaxpr(jax.jit(body))(*inputs)
