@@ -181,9 +181,8 @@ def measure(k: int, count: int, repeats: int, seed: int) -> dict[str, dict]:
     """All solvers on the same grasps with k contacts; the repeats take turns."""
     position, normal, friction = random_grasps(count, k, seed)
     grasp = jg.Grasp(position, normal, jg.HardFinger(friction))
-    single = jg.Grasp(
-        *(x.astype(np.float32) for x in (position, normal)), jg.HardFinger(friction.astype(np.float32))
-    )
+    low = [x.astype(np.float32) for x in (position, normal, friction)]
+    single = jg.Grasp(low[0], low[1], jg.HardFinger(low[2]))
     program = dual_program(grasp)
     runners: list = [
         Ours("jaxgrasp float64, gap 1e-8", grasp),

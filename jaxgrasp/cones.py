@@ -58,11 +58,9 @@ def inner(x: Cone, y: Cone) -> Array:
 
 def tail_inner(x: Cone, y: Cone) -> Array:
     """``<x_1.., y_1..>`` per cone; zero for one-dimensional cones."""
-    return (
-        _total([a * b for a, b in zip(x[1:], y[1:], strict=True)])
-        if len(x) > 1
-        else jnp.zeros_like(x[0] * y[0])
-    )
+    if not x[1:]:
+        return jnp.zeros_like(x[0])
+    return _total([a * b for a, b in zip(x[1:], y[1:], strict=True)])
 
 
 def tail_norm(x: Cone) -> Array:

@@ -160,7 +160,7 @@ def fold(contacts: Contacts, components: tuple[Component, ...]) -> Folded:
 class Projection(NamedTuple):
     """The null space of A, by a Cholesky factor of A A^T.
 
-    sigma  (L,) proven lower bound of the smallest singular value of A, 0 where none is proven: sigma > 0 proves full rank
+    sigma  (L,) proven lower bound of the smallest singular value of A, 0 where none is proven; sigma > 0 proves rank m
     """
 
     factor: Cholesky

@@ -1,7 +1,7 @@
 """From a solved lane to a verdict with its proof: polish, certify, translate back (theory section 2).
 
-The conditions are the checker's (``certificate.py``) with a larger rounding constant, evaluated in the working dtype: what
-passes here passes there. Nothing is claimed that was not certified.
+The conditions are the checker's (``certificate.py``) with a larger rounding constant, evaluated in the working dtype:
+what passes here passes there. Nothing is claimed that was not certified.
 """
 
 from __future__ import annotations
