@@ -56,7 +56,8 @@ class WrenchResistance(eqx.Module):
     rank            of the folded grasp map, as a float so that INVALID can be NaN
     internal_force  (*batch, k n) in the chapter's component order, mean normal force 1: the forces behind ``margin``
                     and the proof of RESISTANT; zero where margin is -inf, NaN where INVALID
-    escape_twist    (*batch, m) (velocity; angular velocity), unit norm: the proof of NOT_RESISTANT; zero where RESISTANT
+    escape_twist    (*batch, m) (velocity; angular velocity), unit norm: the proof of NOT_RESISTANT; zero
+                    where RESISTANT
     iterations      int32 interior-point iterations spent
     stop            int32, a ``solver.Stop``: why the iteration ended; ``Stop(code).sentence`` says it in words
     """

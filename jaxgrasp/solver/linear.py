@@ -20,7 +20,7 @@ Vector = tuple[Array, ...]  # m entries of shape (L,)
 
 
 class Cholesky(NamedTuple):
-    """``M = L L^T``: ``columns[j]`` holds L[j:, j], ``inverse[j]`` is 1 / L[j, j], or 0 where the pivot was rounding."""
+    """``M = L L^T``: ``columns[j]`` holds L[j:, j], ``inverse[j]`` is 1 / L[j, j], or 0 where that was rounding."""
 
     columns: tuple[Array, ...]
     inverse: tuple[Array, ...]
