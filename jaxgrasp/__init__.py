@@ -27,6 +27,7 @@ from .lmi import (
     second_order_cone_lmi,
 )
 from .resistance import WrenchResistance, wrench_resistance
+from .solver import Stop
 from .status import Status
 from .tracing import Trace, load_grasp, save_grasp, trace
 
@@ -59,6 +60,7 @@ __all__ = [
     # 11.2 wrench resistance (force closure)
     "wrench_resistance",
     "WrenchResistance",
+    "Stop",
     "trace",
     "Trace",
     "save_grasp",

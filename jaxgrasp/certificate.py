@@ -68,13 +68,14 @@ def _scaled_force(force, scale, normal_index) -> np.ndarray:
     return np.concatenate([s[..., normal_index : normal_index + 1], tangential], -1)
 
 
-def check_certificate(grasp, result, tolerance: float = 1e-8) -> np.ndarray:
+def check_certificate(grasp, result, tolerance: float | None = None) -> np.ndarray:
     """True for each lane whose verdict the evidence in ``result`` proves; shape (*batch,), numpy bool.
 
     grasp      a ``Grasp``
-    result     what ``wrench_resistance(grasp)`` returned, or anything with ``status``, ``internal_force``,
-               ``escape_twist`` of the same shapes
-    tolerance  the |t*| that MARGINAL may claim; no smaller than the dtype's resolution
+    result     what ``wrench_resistance(grasp)`` returned, or anything with ``status``, ``margin``, ``gap``,
+               ``internal_force``, ``escape_twist`` of the same shapes
+    tolerance  the |t*| that MARGINAL may claim, no smaller than the dtype's resolution; by default what the result's own
+               bracket [margin, margin + gap] claims, as long as that is below 1e-3
 
     Runs on the host in float64 whatever the dtype of the grasp; a few operations a lane.
     """
@@ -151,7 +152,14 @@ def check_certificate(grasp, result, tolerance: float = 1e-8) -> np.ndarray:
         escapes |= rank_deficient
 
         # Both together: t* >= slack - shift, and t* <= 1 + a.y for the multiple of -xi that the dual admits.
-        resolution = max(tolerance, 2e4 * EPS if dtype.itemsize == 8 else 160 * float(np.finfo(dtype).eps))
+        if tolerance is None:
+            margin, gap = lanes(result.margin).astype(np.float64), lanes(result.gap).astype(np.float64)
+            claimed = np.maximum(np.abs(margin), np.abs(margin + gap))
+            claim = np.where(claimed < 1e-3, np.maximum(claimed, 1e-8), 0.0)
+        else:
+            claim = np.full(len(status), float(tolerance))
+        floor = 2e4 * EPS if dtype.itemsize == 8 else 160 * float(np.finfo(dtype).eps)
+        resolution = np.maximum(claim, floor)
         lower = slack - 2 * shift
         total = np.sum(np.where(live, x[..., 0], 0.0), -1)
         reach = np.max(np.where(live, np.linalg.norm(x[..., 1:], axis=-1) - x[..., 0], -np.inf), -1)

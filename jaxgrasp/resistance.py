@@ -273,6 +273,11 @@ def _batched(plan: _Plan) -> Callable[..., WrenchResistance]:
     return run
 
 
+@functools.cache
+def _compiled(plan: _Plan) -> Callable[..., WrenchResistance]:
+    return jax.jit(_batched(plan))
+
+
 _solve_chunk = jax.jit(_solve_rows, static_argnames=("plan",))
 
 
@@ -333,5 +338,5 @@ def wrench_resistance(grasp: Grasp, tolerance: float = 1e-8, verdict_only: bool 
     contacts = contacts_of(grasp)
     traced = any(isinstance(x, Tracer) for x in (*contacts, goal))
     if traced or jax.default_backend() != "cpu":
-        return _batched(plan)(contacts, goal)
+        return _compiled(plan)(contacts, goal)
     return _solve_on_host(plan, contacts, goal)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import zlib
 from pathlib import Path
+from zipfile import BadZipFile
 
 import equinox as eqx
 import jax
@@ -99,6 +101,7 @@ def trace(grasp: Grasp, tolerance: float = 1e-8, max_iterations: int = TOTAL_BUD
     return Trace(*columns, stop=int(state.stop[0]))
 
 
+FORMAT, VERSION = "jaxgrasp lane", 1
 _MODELS = {"Frictionless": Frictionless, "HardFinger": HardFinger, "SoftFinger": SoftFinger}
 
 
@@ -112,19 +115,23 @@ def save_grasp(path: str | os.PathLike, grasp: Grasp) -> None:
     model = type(grasp.model).__name__
     if model not in _MODELS:
         raise ValueError(f"cannot save the contact model {model}; known models: {', '.join(_MODELS)}")
-    header = {"format": "jaxgrasp lane", "version": 1, "model": model}
+    header = {"format": FORMAT, "version": VERSION, "model": model}
     beside = path.with_name(path.name + ".tmp")
-    with open(beside, "wb") as file:
-        np.savez(
-            file,
-            header=np.frombuffer(json.dumps(header).encode(), np.uint8),
-            position=np.asarray(grasp.position),
-            normal=np.asarray(grasp.normal),
-            friction=np.asarray(grasp.model.friction_coefficient),
-            torsion=np.asarray(grasp.model.torsion_coefficient),
-            active=np.asarray(grasp.active),
-        )
-    os.replace(beside, path)
+    try:
+        with open(beside, "wb") as file:
+            np.savez(
+                file,
+                header=np.frombuffer(json.dumps(header).encode(), np.uint8),
+                position=np.asarray(grasp.position),
+                normal=np.asarray(grasp.normal),
+                friction=np.asarray(grasp.model.friction_coefficient),
+                torsion=np.asarray(grasp.model.torsion_coefficient),
+                active=np.asarray(grasp.active),
+            )
+        os.replace(beside, path)
+    except BaseException:
+        beside.unlink(missing_ok=True)
+        raise
 
 
 def load_grasp(path: str | os.PathLike) -> Grasp:
@@ -133,9 +140,11 @@ def load_grasp(path: str | os.PathLike) -> Grasp:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         header = json.loads(arrays["header"].tobytes().decode())
+        if (header["format"], header["version"]) != (FORMAT, VERSION):
+            raise ValueError(f"it holds {header['format']!r} version {header['version']}")
         model = _MODELS[header["model"]]()
-        grasp = (arrays["position"], arrays["normal"], arrays["active"])
         coefficients = jnp.asarray(arrays["friction"]), jnp.asarray(arrays["torsion"])
-    except (OSError, KeyError, ValueError, EOFError) as error:
+        model = model.with_coefficients(*coefficients)
+        return Grasp(arrays["position"], arrays["normal"], model, arrays["active"])
+    except (OSError, KeyError, ValueError, TypeError, AttributeError, EOFError, BadZipFile, zlib.error) as error:
         raise ValueError(f"{path} is not a grasp written by jaxgrasp.save_grasp ({error})") from error
-    return Grasp(grasp[0], grasp[1], model.with_coefficients(*coefficients), grasp[2])

@@ -15,6 +15,7 @@ from .cones import Cone, cone_min, cone_sum, inner, interior_distance
 from .contacts import Component
 from .margin import Folded, Projection, normalized, onto_null_space, smallest_slack, upper_bound
 from .solver.linear import Vector, matvec, rmatvec
+from .solver.linear import solve as solve_factored
 from .solver.stages import stage
 from .status import Status
 
@@ -127,16 +128,21 @@ def judge(
     shift = jnp.sqrt(2 * one) * (residual + rounding * folded.norm * size) / jnp.where(room > 0, room, one)
     resistant = full_rank & (room > 0) & (shift < slack)
 
-    # ... and dual evidence: the bound of t*, and the twist behind it.
+    # ... and dual evidence: the bound of t*, and the twist behind it. Where t* is huge and negative the iterates may
+    # stall, but the twist of the projection still escapes.
+    simple = solve_factored(projection.factor, folded.resultant)
     upper = upper_bound(folded, y)
-    xi = _unit_twist(tuple(-v for v in y))
+    bound = upper_bound(folded, tuple(-v for v in simple))
+    better = bound < upper
+    upper = jnp.where(better, bound, upper)
+    xi = _unit_twist(tuple(jnp.where(better, a, -b) for a, b in zip(simple, y, strict=True)))
     escapes = _escape_depth(folded.columns, folded.exists, xi, rounding) > 0
     null = tuple(rank.null_twist[i] for i in range(m))
     deficient = ~full_rank & (_unseen(folded.columns, null) <= rank_tolerance(dtype) * folded.norm)
 
-    # Rounding in A moves t* by at most eps |A| |lambda| |s| (envelope theorem); the bracket allows for it.
+    # The exact internal force next to s is within shift of it, and has a slack of at least slack - 2 shift.
     blur = 16 * eps * (1 + jnp.abs(slack) + jnp.abs(upper))
-    margin = slack - blur
+    margin = slack - blur - jnp.where(full_rank & (room > 0), 2 * shift, jnp.zeros_like(shift))
     gap = jnp.maximum(upper + blur - margin, jnp.zeros_like(margin))
     close = tolerance + 2 * blur
     marginal = full_rank & (margin >= -close) & (margin + gap <= close)
