@@ -137,7 +137,7 @@ def save_grasp(path: str | os.PathLike, grasp: Grasp) -> None:
 def load_grasp(path: str | os.PathLike) -> Grasp:
     """The grasp that ``save_grasp`` wrote; ValueError if the file is not one."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open(path, "rb") as source, np.load(source, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         header = json.loads(arrays["header"].tobytes().decode())
         if (header["format"], header["version"]) != (FORMAT, VERSION):
