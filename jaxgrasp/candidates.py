@@ -11,6 +11,8 @@ of rows can be drawn at any time, in any order, on any number of threads.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 import numpy as np
 import trimesh
 
@@ -28,14 +30,15 @@ def _generator(seed: int, block: int) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(seed, spawn_key=(block,))))
 
 
-class _Blocks:
+class _Blocks(ABC):
     """Rows [start, stop) put together from whole blocks."""
 
     fingers: int
     seed: int
 
+    @abstractmethod
     def block(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        raise NotImplementedError
+        """Positions and normals of the rows of one block, the same for the same seed and index."""
 
     def rows(self, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
         """Positions and inward unit normals (stop - start, k, 3) of these rows, m, mesh frame."""

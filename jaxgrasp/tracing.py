@@ -146,5 +146,14 @@ def load_grasp(path: str | os.PathLike) -> Grasp:
         coefficients = jnp.asarray(arrays["friction"]), jnp.asarray(arrays["torsion"])
         model = model.with_coefficients(*coefficients)
         return Grasp(arrays["position"], arrays["normal"], model, arrays["active"])
-    except (OSError, KeyError, ValueError, TypeError, AttributeError, EOFError, BadZipFile, zlib.error) as error:
+    except (
+        OSError,
+        KeyError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        EOFError,
+        BadZipFile,
+        zlib.error,
+    ) as error:
         raise ValueError(f"{path} is not a grasp written by jaxgrasp.save_grasp ({error})") from error

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import clarabel
@@ -64,8 +65,10 @@ def test_cholesky_solves_consistent_singular_systems(m, rank):
     x = np.stack(solve_factored(factor, vector(rhs)), -1)
     size = np.linalg.norm(rhs, axis=-1)
     assert (np.linalg.norm((M @ x[..., None])[..., 0] - rhs, axis=-1) <= 1e-8 * size).all()
-    assert np.isinf(inverse_frobenius(factor)).all()
-    assert (sum((np.asarray(v) > 0).astype(int) for v in factor.inverse) == rank).all()
+    # Rounding may pass for a pivot, but never for a smallest eigenvalue beyond rounding.
+    largest = np.linalg.eigvalsh(M)[:, -1]
+    assert (1 / np.asarray(inverse_frobenius(factor)) <= TOLERANCE * largest).all()
+    assert (sum((np.asarray(v) > 0).astype(int) for v in factor.inverse) >= rank).all()
 
 
 def test_cholesky_of_nothing_is_nothing():
@@ -117,7 +120,9 @@ def test_row_svd(m, kind):
     expected = np.linalg.svd(A, compute_uv=False)
     largest = expected[:, :1]
     np.testing.assert_allclose(-np.sort(-values, 1) / largest, expected / largest, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(vectors @ np.swapaxes(vectors, 1, 2), np.tile(np.eye(m), (LANES, 1, 1)), atol=1e-13)
+    np.testing.assert_allclose(
+        vectors @ np.swapaxes(vectors, 1, 2), np.tile(np.eye(m), (LANES, 1, 1)), atol=1e-13
+    )
     images = np.linalg.norm(vectors @ A, axis=-1)
     np.testing.assert_allclose(images / largest, values / largest, rtol=0, atol=1e-14)
     smallest, null = svd.smallest()
@@ -174,7 +179,10 @@ def clarabel_value(B, b, c):
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-10
     size, d = c.size, c.shape[-1]
     A = csc_matrix(np.concatenate([B, -np.eye(size)]))
-    cones = [clarabel.ZeroConeT(len(b)), *([clarabel.SecondOrderConeT(d)] * K if d > 1 else [clarabel.NonnegativeConeT(K)])]
+    cones = [
+        clarabel.ZeroConeT(len(b)),
+        *([clarabel.SecondOrderConeT(d)] * K if d > 1 else [clarabel.NonnegativeConeT(K)]),
+    ]
     right = np.concatenate([b, np.zeros(size)])
     solution = clarabel.DefaultSolver(csc_matrix((size, size)), c.ravel(), A, right, cones, settings).solve()
     assert solution.status in (clarabel.SolverStatus.Solved, clarabel.SolverStatus.AlmostSolved)
@@ -193,8 +201,12 @@ def test_random_cone_programs_against_clarabel(d):
     assert (np.abs(program.dual_value(end.iterate.y) - 0.25 - expected) <= 1e-7 * size).all()
     residual, complementarity = program.optimality(end.iterate.y, end.iterate.u)
     assert max(float(jnp.max(jnp.abs(r))) for r in residual) < 1e-8
-    assert max(float(jnp.max(jnp.abs(r))) for r in complementarity) < 1e-4
     slack = program.slack(end.iterate.y)
+    assert (np.asarray(complementarity[0]).sum(0) <= 1e-8 * size).all()
+    # |u_0 z_1 + z_0 u_1|^2 <= 2 u_0 z_0 <u, z> for any two points of the cone
+    bound = np.sqrt(2 * np.asarray(end.iterate.u[0] * slack[0] * np.maximum(complementarity[0], 0)))
+    tail = np.sqrt(sum(np.asarray(x) ** 2 for x in complementarity[1:]))
+    assert (tail <= bound + 1e-7).all()
     for kept, exact in zip(end.iterate.z, slack, strict=True):
         np.testing.assert_allclose(kept, exact, atol=1e-9)
     assert (np.asarray(end.iterations) <= 15).all()
@@ -213,7 +225,7 @@ def test_finished_lanes_are_frozen_whole(tile):
     """A lane is the same bit for bit whether the loop goes on for others or not."""
     program, point = tile
     budgets = [run(program, point, budget=n) for n in (6, 7, 8, 40)]
-    for early, late in zip(budgets, budgets[1:], strict=False):
+    for early, late in pairwise(budgets):
         done = np.flatnonzero(np.asarray(early.stop) != Stop.RUNNING)
         assert lane_bits(early, done) == lane_bits(late, done)
     assert len(set(np.asarray(budgets[-1].iterations).tolist())) > 1
@@ -222,7 +234,9 @@ def test_finished_lanes_are_frozen_whole(tile):
 def test_a_finished_lane_keeps_its_iterate_when_solved_again(tile):
     program, point = tile
     end = run(program, point)
-    again = jax.jit(lambda p, s: solve(p._replace(constant=0.25), s, jnp.asarray(1e-14), jnp.int32(5)))(program, end)
+    again = jax.jit(lambda p, s: solve(p._replace(constant=0.25), s, jnp.asarray(1e-14), jnp.int32(5)))(
+        program, end
+    )
     assert lane_bits(end, slice(None)) == lane_bits(again, slice(None))
 
 
@@ -325,7 +339,9 @@ def test_padding_cones_take_no_part():
     )
     wide = run(padded, wider)
     np.testing.assert_array_equal(wide.stop, end.stop)
-    np.testing.assert_allclose(padded.primal_value(wide.iterate.u), program.primal_value(end.iterate.u), atol=1e-7)
+    np.testing.assert_allclose(
+        padded.primal_value(wide.iterate.u), program.primal_value(end.iterate.u), atol=1e-7
+    )
 
 
 # Lanes and kernels --------------------------------------------------------------------------------------
@@ -360,10 +376,11 @@ def double(x):
     return 2 * x
 jaxpr = str(jax.make_jaxpr(stages.stage(double))(1.0))
 rng = np.random.default_rng(2)
-position, normal, _ = random_contacts(rng, 200, 4, 3)
-friction, _ = random_coefficients(rng, 200, 4)
-res = jg.wrench_resistance(jg.Grasp(position, normal, jg.HardFinger(friction)))
-np.savez(sys.argv[1], called="pjit" in jaxpr or "jit" in jaxpr, status=res.status, margin=res.margin, rank=res.rank)
+position, normal, _ = random_contacts(rng, 300, 5, 2)
+friction, _ = random_coefficients(rng, 300, 5)
+res = jg.wrench_resistance(jg.Grasp(position, normal, jg.HardFinger(friction)), tolerance=1e-11)
+fields = {name: getattr(res, name) for name in ("status", "margin", "gap", "rank")}
+np.savez(sys.argv[1], called="jit" in jaxpr, **fields)
 """
 
 
@@ -385,4 +402,11 @@ def test_kernels_off_gives_the_same_answers(tmp_path):
     assert (bool(on["called"]), bool(off["called"])) == (True, False)
     np.testing.assert_array_equal(on["status"], off["status"])
     np.testing.assert_array_equal(on["rank"], off["rank"])
-    np.testing.assert_allclose(on["margin"], off["margin"], rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(np.isneginf(on["margin"]), np.isneginf(off["margin"]))
+    finite = np.isfinite(on["margin"])
+    margins, gaps = (np.stack([on[name][finite], off[name][finite]]) for name in ("margin", "gap"))
+    scale = np.maximum(1.0, np.abs(margins[0]))
+    assert (margins.max(0) <= (margins + gaps).min(0) + 1e-10 * scale).all()  # the brackets overlap
+    closed = gaps.max(0) <= 5e-10 * scale
+    assert closed.mean() > 0.98
+    assert (np.abs(margins[0] - margins[1]) <= 1e-9 * scale)[closed].all()

@@ -203,7 +203,9 @@ def spoiled(kind, path, grasps):
         np.savez(path, **{**arrays, "position": np.array([Armed()], dtype=object)})
     elif kind == "flipped bytes":
         middle = content.index(b"position") + 200
-        path.write_bytes(content[:middle] + bytes(255 - b for b in content[middle : middle + 8]) + content[middle + 8 :])
+        path.write_bytes(
+            content[:middle] + bytes(255 - b for b in content[middle : middle + 8]) + content[middle + 8 :]
+        )
     elif kind == "foreign archive":
         np.savez(path, x=np.zeros(3))
     elif kind == "foreign array":
