@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from enum import IntEnum
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -11,12 +13,30 @@ __all__ = [
     "Bool",
     "Float",
     "Int",
+    "SpokenEnum",
     "gap_floor",
     "pivot_tolerance",
     "rank_tolerance",
     "rounding_constant",
     "unit_roundoff",
 ]
+
+
+class SpokenEnum(IntEnum):
+    """Integers for arrays and tables whose members carry the sentence a person reads."""
+
+    sentence: str
+
+    def __new__(cls, value: int, sentence: str):
+        member = int.__new__(cls, value)
+        member._value_ = value
+        member.sentence = sentence
+        return member
+
+    @classmethod
+    def _missing_(cls, value):
+        # An entry of a JAX array: equal to a member, but no key of the enum's table on every Python.
+        return next((member for member in cls if np.ndim(value) == 0 and member.value == value), None)
 
 
 def unit_roundoff(dtype) -> float:

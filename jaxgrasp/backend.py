@@ -47,7 +47,8 @@ def remember_compilations() -> Path | None:
     """Keep compiled programs between runs, so that only the first one waits for the compiler; where they are kept.
 
     They go to ``$XDG_CACHE_HOME/jaxgrasp`` (default ``~/.cache``), apart by processor: a home directory may be shared
-    by machines that do not run each other's code. ``JAX_COMPILATION_CACHE_DIR`` overrides this; set it empty to keep none.
+    by machines that do not run each other's code. ``JAX_COMPILATION_CACHE_DIR``
+    overrides this; set it empty to keep none.
     """
     if "JAX_COMPILATION_CACHE_DIR" in os.environ or jax.config.jax_compilation_cache_dir:  # pyright: ignore
         return None

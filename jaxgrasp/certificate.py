@@ -74,8 +74,8 @@ def check_certificate(grasp, result, tolerance: float | None = None) -> np.ndarr
     grasp      a ``Grasp``
     result     what ``wrench_resistance(grasp)`` returned, or anything with ``status``, ``margin``, ``gap``,
                ``internal_force``, ``escape_twist`` of the same shapes
-    tolerance  the |t*| that MARGINAL may claim, no smaller than the dtype's resolution; by default what the result's own
-               bracket [margin, margin + gap] claims, as long as that is below 1e-3
+    tolerance  the |t*| that MARGINAL may claim, no smaller than the dtype's resolution; by default what the
+               result's own bracket [margin, margin + gap] claims, as long as that is below 1e-3
 
     Runs on the host in float64 whatever the dtype of the grasp; a few operations a lane.
     """
@@ -152,6 +152,8 @@ def check_certificate(grasp, result, tolerance: float | None = None) -> np.ndarr
         escapes |= rank_deficient
 
         # Both together: t* >= slack - shift, and t* <= 1 + a.y for the multiple of -xi that the dual admits.
+        if tolerance is None and not (hasattr(result, "margin") and hasattr(result, "gap")):
+            tolerance = 1e-8  # bare evidence claims no bracket
         if tolerance is None:
             margin, gap = lanes(result.margin).astype(np.float64), lanes(result.gap).astype(np.float64)
             claimed = np.maximum(np.abs(margin), np.abs(margin + gap))

@@ -319,8 +319,8 @@ def wrench_resistance(grasp: Grasp, tolerance: float = 1e-8, verdict_only: bool 
     A grasp is resistant iff its folded grasp map has rank m and t* > 0.
 
     grasp         a ``Grasp`` with any batch axes; works under ``jax.jit`` and ``jax.vmap``
-    tolerance     width of the bracket [margin, margin + gap] to reach, relative to max(1, |t*|); in float32 about
-                  2e-5 is the least that can be had. Enable 64-bit JAX (``jax_enable_x64``) for float64.
+    tolerance     width of the bracket [margin, margin + gap] to reach, relative to max(1, |t*|); float32 usually
+                  closes it to about 1e-3. Enable 64-bit JAX (``jax_enable_x64``) for float64.
     verdict_only  stop each grasp as soon as a certificate exists: faster, with a wider bracket
 
     Returns a ``WrenchResistance``. Bad numbers make their own lane INVALID; nothing raises inside. Wrong types raise

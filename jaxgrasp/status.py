@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-from enum import IntEnum
+from ._types import SpokenEnum
 
 __all__ = ["Status"]
 
 
-class Status(IntEnum):
+class Status(SpokenEnum):
     """What a lane of a batch ended with. ``Status(3).sentence`` says it in words.
 
     The numbers are part of the file format and never change.
     """
-
-    sentence: str
-
-    def __new__(cls, value: int, sentence: str):
-        member = int.__new__(cls, value)
-        member._value_ = value
-        member.sentence = sentence
-        return member
 
     RESISTANT = 1, "Wrench resistant (force closure): the internal force proves it."
     NOT_RESISTANT = 2, "Not wrench resistant: the escape twist is a motion no finger force can oppose."

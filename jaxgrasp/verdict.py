@@ -140,9 +140,10 @@ def judge(
     null = tuple(rank.null_twist[i] for i in range(m))
     deficient = ~full_rank & (_unseen(folded.columns, null) <= rank_tolerance(dtype) * folded.norm)
 
-    # The exact internal force next to s is within shift of it, and has a slack of at least slack - 2 shift.
+    # The exact internal force next to s lies within near / 2 of it, so its slack is at least slack - near.
     blur = 16 * eps * (1 + jnp.abs(slack) + jnp.abs(upper))
-    margin = slack - blur - jnp.where(full_rank & (room > 0), 2 * shift, jnp.zeros_like(shift))
+    near = 2 * jnp.sqrt(2 * one) * (residual + 4 * eps * folded.norm * size) / jnp.where(room > 0, room, one)
+    margin = slack - blur - jnp.where(full_rank & (room > 0), near, jnp.zeros_like(near))
     gap = jnp.maximum(upper + blur - margin, jnp.zeros_like(margin))
     close = tolerance + 2 * blur
     marginal = full_rank & (margin >= -close) & (margin + gap <= close)

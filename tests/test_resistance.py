@@ -337,3 +337,13 @@ def test_status_numbers_and_sentences_are_fixed():
     assert all(s.sentence.endswith(".") for s in Status)
     assert [s.value for s in Stop] == [0, 1, 2, 3, 4, 5]
     assert all(s.sentence.endswith(".") for s in Stop)
+
+
+@pytest.mark.parametrize("enum", [Status, Stop])
+def test_members_are_found_by_entries_of_arrays_and_by_nothing_else(enum):
+    for member in enum:
+        for array in (np.array([member.value], np.int32), jnp.array([member.value], jnp.int32)):
+            assert enum(array[0]) is member
+    for wrong in (17, 1.5, "RESISTANT", None, np.array([1, 2])):
+        with pytest.raises(ValueError, match="not a valid"):
+            enum(wrong)

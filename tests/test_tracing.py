@@ -12,7 +12,7 @@ from families import random_coefficients, random_contacts
 import jaxgrasp as jg
 from jaxgrasp.solver import Stop
 
-K = 5
+K = 6
 
 
 @pytest.fixture(scope="module")

@@ -16,13 +16,12 @@ that would lose the interior or the best gap is not taken, so every lane keeps i
 from __future__ import annotations
 
 from collections.abc import Callable
-from enum import IntEnum
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
 
-from .._types import Array, pivot_tolerance
+from .._types import Array, SpokenEnum, pivot_tolerance
 from ..cones import (
     Cone,
     Scaling,
@@ -47,16 +46,8 @@ STALL_RATIO = 0.9  # a step that leaves more of the gap than this is slow
 PATIENCE = 3  # slow steps in a row before a lane gives up
 
 
-class Stop(IntEnum):
+class Stop(SpokenEnum):
     """Why a lane stopped; ``Stop(2).sentence`` says it in words."""
-
-    sentence: str
-
-    def __new__(cls, value: int, sentence: str):
-        member = int.__new__(cls, value)
-        member._value_ = value
-        member.sentence = sentence
-        return member
 
     RUNNING = 0, "The iteration budget ended first; the best iterate is kept."
     CONVERGED = 1, "The duality gap reached its tolerance."
