@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -34,7 +35,7 @@ class SpokenEnum(IntEnum):
         return member
 
     @classmethod
-    def _missing_(cls, value):
+    def _missing_(cls, value: Any):
         # An entry of a JAX array: equal to a member, but no key of the enum's table on every Python.
         return next((member for member in cls if np.ndim(value) == 0 and member.value == value), None)
 
