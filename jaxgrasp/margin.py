@@ -2,7 +2,7 @@
 
     t* = max t   subject to   A s = 0,   s_0,i - |s_1..,i| >= t,   sum_i s_0,i = k
 
-A is the folded grasp map with lengths divided by L. Substituting u = s - t e makes it a cone program
+A is the folded grasp map, lengths divided by L, rows orthonormalised. Substituting u = s - t e makes it a cone program
 
     minimise -1 + (1/k) sum_i u_0,i   subject to   B u = -a,  u in K,     a = sum_i A_i e,  B = A - a e^T / k,
 
@@ -16,14 +16,21 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from ._types import Array, pivot_tolerance, rounding_constant, unit_roundoff
+from ._types import Array, rank_tolerance, rounding_constant, unit_roundoff
 from .cones import Cone, cone_max, cone_min, cone_sum, inner, interior_distance, tail_norm
 from .contacts import Component
 from .geometry import cross_components, frame_components, normalize_components
 from .lanes import to_lanes
 from .solver import ConeProgram, Iterate
-from .solver.linear import Cholesky, Vector, cholesky, gram, inverse_frobenius, matvec, rmatvec
-from .solver.linear import solve as solve_factored
+from .solver.linear import (
+    Cholesky,
+    Vector,
+    inverse_frobenius,
+    matvec,
+    orthonormal_rows,
+    rmatvec,
+    solve_transposed,
+)
 from .solver.stages import stage
 
 __all__ = [
@@ -158,21 +165,31 @@ def fold(contacts: Contacts, components: tuple[Component, ...]) -> Folded:
 
 
 class Projection(NamedTuple):
-    """The null space of A, by a Cholesky factor of A A^T.
+    """``A = L Q``: Q has orthonormal rows, hence the same null space and the same margin, and far better numbers.
 
-    sigma  (L,) proven lower bound of the smallest singular value of A, 0 where none is proven; sigma > 0 proves rank m
+    basis   the tile with Q in place of A
+    factor  L
+    sigma   (L,) proven lower bound of the smallest singular value of A, 0 where none is proven; sigma > 0 proves rank m
     """
 
+    basis: Folded
     factor: Cholesky
     sigma: Array
 
 
 def project(folded: Folded) -> Projection:
-    """Factor A A^T; ``sigma^2 >= 1 / trace((A A^T)^-1) - c eps |A|^2`` allows for rounding in the factor."""
-    eps = unit_roundoff(folded.norm.dtype)
-    factor = cholesky(gram(folded.columns), pivot_tolerance(folded.norm.dtype))
-    square = 1 / inverse_frobenius(factor) - rounding_constant() * eps * folded.norm * folded.norm
-    return Projection(factor, jnp.sqrt(jnp.maximum(square, jnp.zeros_like(square))))
+    """Orthonormalise the rows of A; ``sigma >= 1 / |L^-1| - c eps |A|`` allows for rounding in L."""
+    dtype = folded.norm.dtype
+    columns, factor = orthonormal_rows(folded.columns, rank_tolerance(dtype) * folded.norm)
+    basis = folded._replace(columns=columns, resultant=_resultant(columns[0]))
+    rounding = rounding_constant() * unit_roundoff(dtype) * folded.norm
+    sigma = 1 / jnp.sqrt(inverse_frobenius(factor)) - rounding
+    return Projection(basis, factor, jnp.maximum(sigma, jnp.zeros_like(sigma)))
+
+
+def to_twist(projection: Projection, y: Vector) -> Vector:
+    """The twist lambda of A for the multipliers y of Q: ``A^T lambda = Q^T y``, ``lambda = L^-T y``."""
+    return solve_transposed(projection.factor, y)
 
 
 @stage
@@ -186,10 +203,11 @@ def _removed(columns: Cone, s: Cone, y: Vector) -> Cone:
     return tuple(a - b for a, b in zip(s, rmatvec(columns, y), strict=True))
 
 
-def onto_null_space(folded: Folded, projection: Projection, s: Cone) -> Cone:
-    """``s - A^T (A A^T)^-1 A s``, twice, so that A s is rounding."""
+def onto_null_space(projection: Projection, s: Cone) -> Cone:
+    """``s - Q^T Q s``, twice, so that A s is rounding."""
+    columns = projection.basis.columns
     for _ in range(2):
-        s = _removed(folded.columns, s, solve_factored(projection.factor, _applied(folded.columns, s)))
+        s = _removed(columns, s, _applied(columns, s))
     return s
 
 
@@ -222,7 +240,7 @@ class Start(NamedTuple):
     """Where a lane begins: an interior iterate, and what the projection of e alone already shows.
 
     lower      (L,) the margin of the projected unit forces, a lower bound of t*
-    escape     (L,) bool: lambda = -(A A^T)^-1 a is an escape twist, so t* < 0
+    escape     (L,) bool: the least-squares twist, ``A^T xi`` nearest to e, is an escape twist, so t* < 0
     unbounded  (L,) bool: e lies in the row space of A: no internal force has a normal component, t* = -inf
     """
 
@@ -245,15 +263,16 @@ def starting_point(folded: Folded, projection: Projection) -> Start:
     dtype = folded.norm.dtype
     eps = unit_roundoff(dtype)
     e = identity(folded)
-    y = solve_factored(projection.factor, folded.resultant)
-    raw = onto_null_space(folded, projection, e)
+    y = projection.basis.resultant  # Q e, so Q^T y is the part of e that no internal force can have
+    raw = onto_null_space(projection, e)
     square = cone_sum(inner(raw, raw))
     unbounded = square <= (1024 * eps) ** 2 * folded.count
     s = normalized(folded, raw)
     lower = smallest_slack(folded.exists, s)
     lower = jnp.where(unbounded, jnp.full_like(lower, -jnp.inf), lower)
-    opposing = _removed(folded.columns, tuple(jnp.zeros_like(x) for x in e), tuple(-v for v in y))  # A^T y
-    escape = smallest_slack(folded.exists, opposing) > 64 * eps * folded.norm * _size(y)
+    opposing = tuple(a - b for a, b in zip(e, raw, strict=True))
+    twist_size = _size(to_twist(projection, y))
+    escape = smallest_slack(folded.exists, opposing) > 64 * eps * folded.norm * twist_size
 
     u = _interior(folded.exists, s, jnp.where(unbounded, jnp.zeros_like(lower), lower))
     share = jnp.where(folded.exists > 0, 1 / folded.count, jnp.ones_like(folded.exists))

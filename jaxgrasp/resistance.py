@@ -114,7 +114,7 @@ def _room_for_rounding(folded: Folded, sigma: Array) -> Array:
 def _decision(folded: Folded, sigma: Array) -> Callable[[ConeProgram, Iterate], Array]:
     """Whether the bracket proves a yes or a no, with the room for rounding that ``judge`` will ask for."""
     yes = _room_for_rounding(folded, sigma)
-    unit = rounding_constant() * unit_roundoff(folded.norm.dtype) * folded.norm * folded.count
+    no = yes  # the twist L^-T y is at most |y| / sigma long
 
     def decided(program: ConeProgram, point: Iterate) -> Array:
         lower = -program.primal_value(point.u)
@@ -122,7 +122,7 @@ def _decision(folded: Folded, sigma: Array) -> Callable[[ConeProgram, Iterate], 
         square = point.y[0] * point.y[0]
         for v in point.y[1:]:
             square = square + v * v
-        return (lower > yes) | (upper < -4 * unit * jnp.sqrt(square))
+        return (lower > yes) | (upper < -no * jnp.sqrt(square))
 
     return decided
 
@@ -141,7 +141,7 @@ def _setup_kernel(plan: _Plan) -> Callable[[Contacts], _Setup]:
         folded = fold(contacts, plan.components)
         projection = project(folded)
         start = starting_point(folded, projection)
-        program = margin_program(folded)
+        program = margin_program(projection.basis)
         refuted = start.unbounded | (start.escape if plan.verdict_only else jnp.zeros_like(start.escape))
         dual = tuple(jnp.where(refuted, v, jnp.zeros_like(v)) for v in start.iterate.y)
         state = begin(program, start.iterate._replace(y=dual), ~folded.valid | refuted)
@@ -158,7 +158,7 @@ def _iterate_kernel(plan: _Plan) -> Callable[..., _State]:
     @kernel
     def run(contacts: Contacts, rows: _State, sigma: Array, budget: Array, tolerance: Array) -> _State:
         folded = fold(contacts, plan.components)
-        program = margin_program(folded)
+        program = margin_program(project(folded).basis)
         decided = _decision(folded, sigma) if plan.verdict_only else None
         return _State.pack(solve(program, rows.unpack(), tolerance, budget, decided))
 

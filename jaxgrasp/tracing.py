@@ -57,7 +57,8 @@ class Trace(eqx.Module):
 
 def _tile(contacts: Contacts, components: tuple[Component, ...]):
     folded = fold(contacts, components)
-    return folded, margin_program(folded)
+    projection = project(folded)
+    return folded, projection, margin_program(projection.basis)
 
 
 def trace(grasp: Grasp, tolerance: float = 1e-8, max_iterations: int = TOTAL_BUDGET) -> Trace:
@@ -75,19 +76,19 @@ def trace(grasp: Grasp, tolerance: float = 1e-8, max_iterations: int = TOTAL_BUD
 
     @jax.jit
     def first(rows: Contacts) -> Progress:
-        folded, program = _tile(rows, components)
-        start = starting_point(folded, project(folded))
+        folded, projection, program = _tile(rows, components)
+        start = starting_point(folded, projection)
         dual = tuple(jnp.where(start.unbounded, v, jnp.zeros_like(v)) for v in start.iterate.y)
         return begin(program, start.iterate._replace(y=dual), ~folded.valid | start.unbounded)
 
     @jax.jit
     def values(rows: Contacts, state: Progress) -> tuple[Array, Array]:
-        _, program = _tile(rows, components)
+        *_, program = _tile(rows, components)
         return -program.primal_value(state.iterate.u), -program.dual_value(state.iterate.y)
 
     @jax.jit
     def step(rows: Contacts, state: Progress) -> tuple[Progress, Step]:
-        _, program = _tile(rows, components)
+        *_, program = _tile(rows, components)
         return advance(program, state, goal)
 
     state = first(rows)

@@ -13,9 +13,8 @@ import jax.numpy as jnp
 from ._types import Array, rank_tolerance, rounding_constant, unit_roundoff
 from .cones import Cone, cone_min, cone_sum, inner, interior_distance
 from .contacts import Component
-from .margin import Folded, Projection, normalized, onto_null_space, smallest_slack, upper_bound
+from .margin import Folded, Projection, normalized, onto_null_space, smallest_slack, to_twist, upper_bound
 from .solver.linear import Vector, matvec, rmatvec
-from .solver.linear import solve as solve_factored
 from .solver.stages import stage
 from .status import Status
 
@@ -117,7 +116,7 @@ def judge(
     # Primal evidence: the exact internal force next to s = u - t e ...
     t = 1 - cone_sum(folded.exists * u[0]) / folded.count
     s = (folded.exists * (u[0] + t), *(folded.exists * x for x in u[1:]))
-    s = normalized(folded, onto_null_space(folded, projection, s))
+    s = normalized(folded, onto_null_space(projection, s))
     slack = smallest_slack(folded.exists, s)
     residual, size = _norms(folded.columns, s)
     proven = projection.sigma > 0
@@ -130,12 +129,13 @@ def judge(
 
     # ... and dual evidence: the bound of t*, and the twist behind it. Where t* is huge and negative the iterates may
     # stall, but the twist of the projection still escapes.
-    simple = solve_factored(projection.factor, folded.resultant)
-    upper = upper_bound(folded, y)
-    bound = upper_bound(folded, tuple(-v for v in simple))
+    simple = projection.basis.resultant
+    upper = upper_bound(projection.basis, y)
+    bound = upper_bound(projection.basis, tuple(-v for v in simple))
     better = bound < upper
     upper = jnp.where(better, bound, upper)
-    xi = _unit_twist(tuple(jnp.where(better, a, -b) for a, b in zip(simple, y, strict=True)))
+    opposing = tuple(jnp.where(better, a, -b) for a, b in zip(simple, y, strict=True))
+    xi = _unit_twist(to_twist(projection, opposing))
     escapes = _escape_depth(folded.columns, folded.exists, xi, rounding) > 0
     null = tuple(rank.null_twist[i] for i in range(m))
     deficient = ~full_rank & (_unseen(folded.columns, null) <= rank_tolerance(dtype) * folded.norm)
@@ -144,7 +144,12 @@ def judge(
     blur = 16 * eps * (1 + jnp.abs(slack) + jnp.abs(upper))
     near = 2 * jnp.sqrt(2 * one) * (residual + 4 * eps * folded.norm * size) / jnp.where(room > 0, room, one)
     margin = slack - blur - jnp.where(full_rank & (room > 0), near, jnp.zeros_like(near))
-    gap = jnp.maximum(upper + blur - margin, jnp.zeros_like(margin))
+    upper = upper + blur
+    margin, upper = (
+        jnp.minimum(margin, upper),
+        jnp.maximum(margin, upper),
+    )  # rounding must not turn the bracket round
+    gap = upper - margin
     close = tolerance + 2 * blur
     marginal = full_rank & (margin >= -close) & (margin + gap <= close)
 

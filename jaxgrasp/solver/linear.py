@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from .._types import Array
-from ..cones import Cone
+from ..cones import Cone, cone_sum, inner
 from .stages import stage
 
 __all__ = ["Cholesky", "cholesky", "gram", "inverse_frobenius", "matvec", "rmatvec"]
@@ -93,6 +93,19 @@ def solve(factor: Cholesky, rhs: Vector) -> Vector:
 
 
 @stage
+def solve_transposed(factor: Cholesky, rhs: Vector) -> Vector:
+    """``L^-T rhs`` by back substitution; zero where the pivot was rounding."""
+    columns, inverse = factor
+    m = len(inverse)
+    x = list(rhs)
+    for i in reversed(range(m)):
+        for q in range(i + 1, m):
+            x[i] = x[i] - columns[i][q - i] * x[q]
+        x[i] = x[i] * inverse[i]
+    return tuple(x)
+
+
+@stage
 def inverse_frobenius(factor: Cholesky) -> Array:
     """``|L^-1|_F^2 = trace(M^-1)``, an upper bound of 1 / lambda_min(M); infinite where a pivot was dropped."""
     columns, inverse = factor
@@ -132,6 +145,78 @@ def _gram_column(columns: Cone, j: int) -> Array:
         return total
 
     return products(columns)
+
+
+@stage
+def _row_norm(row: Cone, floor: Array) -> tuple[Array, Array]:
+    square = cone_sum(inner(row, row))
+    norm = jnp.sqrt(square)
+    kept = norm > floor
+    zero, one = jnp.zeros_like(norm), jnp.ones_like(norm)
+    return jnp.where(kept, norm, zero), jnp.where(kept, 1 / jnp.where(kept, norm, one), zero)
+
+
+@stage
+def _row_scaled(row: Cone, factor: Array) -> Cone:
+    return tuple(x * factor for x in row)
+
+
+@stage
+def _row_products(row: Cone, below: Cone) -> Array:
+    total = None
+    for x, rest in zip(row, below, strict=True):
+        for i in range(x.shape[0]):
+            term = rest[:, i] * x[i]
+            total = term if total is None else total + term
+    assert total is not None
+    return total
+
+
+@stage
+def _cleared(rows: list[Cone], head: Cone) -> Cone:
+    overlaps = [cone_sum(inner(row, head)) for row in rows]
+    for row, overlap in zip(rows, overlaps, strict=True):
+        head = tuple(x - overlap * q for x, q in zip(head, row, strict=True))
+    return head
+
+
+@stage
+def _row_removed(row: Cone, below: Cone, products: Array) -> Cone:
+    return tuple(rest - products[:, None] * x[None] for x, rest in zip(row, below, strict=True))
+
+
+def orthonormal_rows(columns: Cone, floor: Array) -> tuple[Cone, Cholesky]:
+    """``A = L Q`` with orthonormal rows of Q, by modified Gram-Schmidt, for A given as d arrays (m, k, L).
+
+    A row whose remainder is not longer than ``floor`` depends on those above it and becomes zero. Each remainder is
+    cleared of the rows above once more: twice is enough (Kahan, Parlett) for orthogonality to rounding.
+    """
+    m = columns[0].shape[0]
+    rest: Cone = columns
+    rows: list[Cone] = []
+    lower: list[Array] = []
+    inverse: list[Array] = []
+    for i in range(m):
+        head: Cone = tuple(c[0] for c in rest)
+        if rows:
+            head = _cleared(rows, head)
+        norm, reciprocal = _row_norm(head, floor)
+        row = _row_scaled(head, reciprocal)
+        below = tuple(c[1:] for c in rest)
+        if i < m - 1:
+            products = _row_products(row, below)
+            rest = _row_removed(row, below, products)
+            lower.append(jnp.concatenate([norm[None], products]))
+        else:
+            lower.append(norm[None])
+        rows.append(row)
+        inverse.append(reciprocal)
+    return _stacked(rows), Cholesky(tuple(lower), tuple(inverse))
+
+
+@stage
+def _stacked(rows: list[Cone]) -> Cone:
+    return tuple(jnp.stack(parts) for parts in zip(*rows, strict=True))
 
 
 def matvec(columns: Cone, x: Cone) -> Array:
