@@ -88,7 +88,8 @@ class Ours:
         }
         if not self.options:
             entry["largest_difference"] = _difference(np.asarray(res.margin), reference)
-            entry["largest_gap"] = float(np.max(np.asarray(res.gap) / np.maximum(1, np.abs(reference))))
+            size = np.maximum(1, np.abs(np.where(np.isfinite(reference), reference, 0)))
+            entry["largest_gap"] = float(np.max(np.asarray(res.gap) / size))
         return entry
 
 
@@ -174,6 +175,8 @@ class Clarabel:
 
 
 def _difference(margins: np.ndarray, reference: np.ndarray) -> float:
+    finite = np.isfinite(reference) & np.isfinite(margins)  # t* = -inf where no internal force presses
+    margins, reference = margins[finite], reference[finite]
     return float(np.max(np.abs(margins - reference) / np.maximum(1, np.abs(reference)), initial=0.0))
 
 

@@ -15,7 +15,7 @@ from scipy.sparse import csc_matrix
 
 from jaxgrasp import lanes
 from jaxgrasp.singular import row_svd
-from jaxgrasp.solver import ConeProgram, Iterate, Stop
+from jaxgrasp.solver import ConeProgram, Iterate, Stop, linear
 from jaxgrasp.solver.interior_point import begin, solve
 from jaxgrasp.solver.linear import cholesky, gram, inverse_frobenius, matvec, rmatvec
 from jaxgrasp.solver.linear import solve as solve_factored
@@ -410,3 +410,32 @@ def test_kernels_off_gives_the_same_answers(tmp_path):
     closed = gaps.max(0) <= 5e-10 * scale
     assert closed.mean() > 0.98
     assert (np.abs(margins[0] - margins[1]) <= 1e-9 * scale)[closed].all()
+
+
+@pytest.mark.parametrize("m", [3, 6])
+def test_orthonormal_rows_reproduce_the_matrix(m, dtype):
+    """A = L Q, Q Q^T = I on the independent rows; a dependent row becomes zero, a graded one stays orthogonal."""
+    rng = np.random.default_rng(m)
+    A = rng.normal(size=(m, 4, 3, 8))
+    A[-1, ..., 1] = A[0, ..., 1] - 2 * A[1, ..., 1]  # dependent
+    A[-1, ..., 2] = A[0, ..., 2] + (1e-9 if dtype == "float64" else 1e-3) * A[-1, ..., 2]  # nearly so
+    A = A.astype(dtype)
+    eps = np.finfo(dtype).eps
+    floor = 64 * eps * np.sqrt((A**2).sum((0, 1, 2)))
+    columns = tuple(jnp.asarray(A[:, :, j]) for j in range(3))
+    rows, factor = linear.orthonormal_rows(columns, jnp.asarray(floor.astype(dtype)))
+    Q = np.stack([np.asarray(r) for r in rows], 2)
+    L = np.zeros((m, m, 8))
+    for j, column in enumerate(factor.columns):
+        L[j:, j] = np.asarray(column)
+    np.testing.assert_allclose(np.einsum("ijl,jkdl->ikdl", L, Q), A, atol=100 * eps)
+    product = np.einsum("ikdl,jkdl->ijl", Q, Q)
+    expected = np.repeat(np.eye(m)[..., None], 8, -1)
+    expected[-1, -1, 1] = 0
+    np.testing.assert_allclose(product, expected, atol=50 * eps)
+    y = rng.normal(size=(m, 8)).astype(dtype)
+    twist = np.stack(
+        [np.asarray(t) for t in linear.solve_transposed(factor, tuple(jnp.asarray(v) for v in y))]
+    )
+    kept = np.delete(np.arange(8), [1, 2])
+    np.testing.assert_allclose(np.einsum("jil,jl->il", L, twist)[:, kept], y[:, kept], atol=1e4 * eps)
