@@ -75,34 +75,32 @@ def cholesky(M: tuple[Array, ...], tolerance: float) -> Cholesky:
     return Cholesky(tuple(columns), tuple(inverse))
 
 
+def _back_substituted(factor: Cholesky, rhs: Vector) -> Vector:
+    columns, inverse = factor
+    x = list(rhs)
+    for i in reversed(range(len(x))):
+        for q in range(i + 1, len(x)):
+            x[i] = x[i] - columns[i][q - i] * x[q]
+        x[i] = x[i] * inverse[i]
+    return tuple(x)
+
+
 @stage
 def solve(factor: Cholesky, rhs: Vector) -> Vector:
     """``M^-1 rhs`` by forward and back substitution."""
     columns, inverse = factor
-    m = len(inverse)
     x = list(rhs)
-    for i in range(m):
+    for i in range(len(x)):
         for q in range(i):
             x[i] = x[i] - columns[q][i - q] * x[q]
         x[i] = x[i] * inverse[i]
-    for i in reversed(range(m)):
-        for q in range(i + 1, m):
-            x[i] = x[i] - columns[i][q - i] * x[q]
-        x[i] = x[i] * inverse[i]
-    return tuple(x)
+    return _back_substituted(factor, tuple(x))
 
 
 @stage
 def solve_transposed(factor: Cholesky, rhs: Vector) -> Vector:
-    """``L^-T rhs`` by back substitution; zero where the pivot was rounding."""
-    columns, inverse = factor
-    m = len(inverse)
-    x = list(rhs)
-    for i in reversed(range(m)):
-        for q in range(i + 1, m):
-            x[i] = x[i] - columns[i][q - i] * x[q]
-        x[i] = x[i] * inverse[i]
-    return tuple(x)
+    """``L^-T rhs``; zero where the pivot was rounding."""
+    return _back_substituted(factor, rhs)
 
 
 @stage
