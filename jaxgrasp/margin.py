@@ -77,13 +77,20 @@ class Folded(NamedTuple):
 
 @stage
 def _screen(
-    position: Array, normal: Array, friction: Array, torsion: Array, active: Array
+    position: tuple[Array, ...], normal: tuple[Array, ...], friction: Array, torsion: Array, active: Array
 ) -> tuple[Array, Array]:
-    """Which lanes are grasps, and which of their contacts count. Arrays (k, dim, L) and (k, L)."""
-    size = jnp.max(jnp.abs(normal), axis=1)
-    usable = jnp.all(jnp.isfinite(position) & jnp.isfinite(normal), axis=1) & (size > 0)
-    usable = usable & jnp.isfinite(friction) & jnp.isfinite(torsion) & (friction >= 0) & (torsion >= 0)
-    valid = jnp.all(usable | ~active, axis=0) & jnp.any(active, axis=0)
+    """Which lanes are grasps, and which of their contacts count; coordinates and coefficients (k, L)."""
+    usable = jnp.isfinite(friction) & jnp.isfinite(torsion) & (friction >= 0) & (torsion >= 0)
+    points = jnp.zeros_like(usable)
+    for x in normal:
+        points = points | (x != 0)
+    for x in (*position, *normal):
+        usable = usable & jnp.isfinite(x)
+    sound = (usable & points) | ~active
+    valid, some = sound[0], active[0]
+    for i in range(1, active.shape[0]):
+        valid, some = valid & sound[i], some | active[i]
+    valid = valid & some
     return valid, active & valid
 
 
@@ -136,7 +143,11 @@ def fold(contacts: Contacts, components: tuple[Component, ...]) -> Folded:
         to_lanes(contacts.active),
     )
     dtype, dimension = position.dtype, position.shape[1]
-    valid, live = _screen(position, normal, friction, torsion, active)
+    coordinates = (
+        tuple(position[:, i] for i in range(dimension)),
+        tuple(normal[:, i] for i in range(dimension)),
+    )
+    valid, live = _screen(*coordinates, friction, torsion, active)
     exists = live.astype(dtype)
     point = tuple(jnp.where(live, position[:, i], jnp.zeros_like(position[:, i])) for i in range(dimension))
     length = _length(point)

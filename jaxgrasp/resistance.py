@@ -291,12 +291,13 @@ def _solve_on_host(plan: _Plan, contacts: Contacts, tolerance: Array) -> WrenchR
         count = min(CHUNK, n - start)
         chunk = []
         for x in rows:
-            part = np.zeros((CHUNK, *x.shape[1:]), x.dtype)
-            part[:count] = x[start : start + count]
+            part = x[start : start + count]
+            if count < CHUNK:
+                part = np.concatenate([part, np.zeros((CHUNK - count, *x.shape[1:]), x.dtype)])
             chunk.append(part)
         result = _solve_chunk(plan, Contacts(*chunk), jnp.int32(count), tolerance)
         results.append(jax.tree.map(lambda x, c=count: np.asarray(x)[:c], result))
-    joined = jax.tree.map(lambda *parts: np.concatenate(parts), *results)
+    joined = jax.tree.map(lambda *parts: np.concatenate(parts) if parts[1:] else parts[0], *results)
     return jax.tree.map(lambda x: jnp.asarray(x.reshape((*batch, *x.shape[1:]))), joined)
 
 
