@@ -42,7 +42,8 @@ from .verdict import Rank, Verdict, judge
 
 __all__ = ["WrenchResistance", "wrench_resistance"]
 
-FIRST_BUDGET = 8  # iterations before stragglers are gathered: most lanes need 6 to 8
+FIRST_BUDGET = 8  # iterations before stragglers are gathered: most lanes need 6 to 8 ...
+VERDICT_BUDGET = 2  # ... and most verdicts none, one or two
 TOTAL_BUDGET = 60
 CHUNK = 4096  # grasps an executable takes at once when called on concrete arrays
 
@@ -228,7 +229,8 @@ def _solve_rows(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array)
     sigma = jnp.where(doubtful & full_rank, ranks.smallest, setup.sigma)
 
     iterate = _iterate_kernel(plan)
-    budgets = jnp.array([FIRST_BUDGET, TOTAL_BUDGET - FIRST_BUDGET], jnp.int32)
+    first = VERDICT_BUDGET if plan.verdict_only else FIRST_BUDGET
+    budgets = jnp.array([first, TOTAL_BUDGET - first], jnp.int32)
 
     def one_round(i: Array, state: _State) -> _State:
         # A rank-deficient grasp has its verdict; only its margin is left to find.
