@@ -11,7 +11,6 @@ from functools import reduce
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import lax
 
 from ._types import Array
 
@@ -128,8 +127,3 @@ class Scaling(NamedTuple):
 def interior_rate(rho: Cone) -> Array:
     """``|rho_1..| - rho_0``: how fast ``e + t rho`` approaches the boundary of its cone."""
     return tail_norm(rho) - rho[0]
-
-
-def reciprocal_root(x: Array) -> Array:
-    """``1 / sqrt(x)``."""
-    return lax.rsqrt(x)

@@ -114,8 +114,7 @@ def _room_for_rounding(folded: Folded, sigma: Array) -> Array:
 
 def _decision(folded: Folded, sigma: Array) -> Callable[[ConeProgram, Iterate], Array]:
     """Whether the bracket proves a yes or a no, with the room for rounding that ``judge`` will ask for."""
-    yes = _room_for_rounding(folded, sigma)
-    no = yes  # the twist L^-T y is at most |y| / sigma long
+    room = _room_for_rounding(folded, sigma)  # for a no, too: the twist L^-T y is at most |y| / sigma long
 
     def decided(program: ConeProgram, point: Iterate) -> Array:
         lower = -program.primal_value(point.u)
@@ -123,7 +122,7 @@ def _decision(folded: Folded, sigma: Array) -> Callable[[ConeProgram, Iterate], 
         square = point.y[0] * point.y[0]
         for v in point.y[1:]:
             square = square + v * v
-        return (lower > yes) | (upper < -no * jnp.sqrt(square))
+        return (lower > room) | (upper < -room * jnp.sqrt(square))
 
     return decided
 
@@ -166,31 +165,23 @@ def _iterate_kernel(plan: _Plan) -> Callable[..., _State]:
     return run
 
 
-class _RankRows(NamedTuple):
-    count: Array
-    smallest: Array
-    null_twist: Array
-
-
-def _rank_kernel(plan: _Plan) -> Callable[[Contacts], _RankRows]:
+def _rank_kernel(plan: _Plan) -> Callable[[Contacts], Rank]:
     @kernel
-    def run(contacts: Contacts) -> _RankRows:
+    def run(contacts: Contacts) -> Rank:
         folded = fold(contacts, plan.components)
         A = jnp.concatenate(folded.columns, axis=1)
         svd = row_svd(A)
         smallest, null = svd.smallest()
         largest = cone_max(svd.values)
         count = cone_sum((svd.values > rank_tolerance(A.dtype) * largest).astype(A.dtype))
-        return _RankRows(count, smallest, to_rows(null))
+        return Rank(count, smallest, to_rows(null))
 
     return run
 
 
 def _answer_kernel(plan: _Plan) -> Callable[..., Verdict]:
     @kernel
-    def run(
-        contacts: Contacts, rows: _State, unbounded: Array, rank_rows: _RankRows, tolerance: Array
-    ) -> Verdict:
+    def run(contacts: Contacts, rows: _State, unbounded: Array, rank_rows: Rank, tolerance: Array) -> Verdict:
         folded = fold(contacts, plan.components)
         projection = project(folded)
         iterate = rows.unpack().iterate
@@ -198,7 +189,7 @@ def _answer_kernel(plan: _Plan) -> Callable[..., Verdict]:
             folded,
             projection,
             unbounded,
-            Rank(rank_rows.count, rank_rows.smallest, to_lanes(rank_rows.null_twist)),
+            rank_rows._replace(null_twist=to_lanes(rank_rows.null_twist)),
             iterate.u,
             iterate.y,
             tolerance,
@@ -223,7 +214,7 @@ def _solve_rows(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array)
     exists = jnp.arange(n, dtype=jnp.int32) < count
 
     doubtful = exists & (setup.sigma <= 0)
-    ranks = _RankRows(jnp.full(n, m, dtype), setup.sigma, jnp.zeros((n, m), dtype))
+    ranks = Rank(jnp.full(n, m, dtype), setup.sigma, jnp.zeros((n, m), dtype))
     ranks = map_selected(_rank_kernel(plan), doubtful, contacts, ranks, width)
     full_rank = ranks.count >= m
     sigma = jnp.where(doubtful & full_rank, ranks.smallest, setup.sigma)

@@ -30,7 +30,6 @@ from ..cones import (
     determinant,
     inner,
     interior_rate,
-    reciprocal_root,
     scaled_product,
     tail_inner,
 )
@@ -90,12 +89,12 @@ def _determinant_roots(u: Cone, z: Cone) -> tuple[Array, Array]:
 
 @stage
 def _scaling_factors(root_u: Array, root_z: Array) -> tuple[Array, Array, Array, Array]:
-    return 1 / root_u, 1 / root_z, jnp.sqrt(root_u / root_z), reciprocal_root(root_u * root_z)
+    return 1 / root_u, 1 / root_z, jnp.sqrt(root_u / root_z), lax.rsqrt(root_u * root_z)
 
 
 @stage
 def _half_angle(u: Cone, z: Cone, inverse_u: Array, inverse_z: Array) -> Array:
-    return reciprocal_root(2 * (1 + inner(u, z) * inverse_u * inverse_z))
+    return lax.rsqrt(2 * (1 + inner(u, z) * inverse_u * inverse_z))
 
 
 @stage
