@@ -5,6 +5,8 @@ Names follow the chapter "Wrench Resistant Grasps"; wrench resistance is what ot
 
 from .certificate import check_certificate
 from .contacts import ContactModel, Frictionless, HardFinger, SoftFinger
+from .criteria import Criterion, Gentlest, LeastNorm, Robust, SmallestSum, SumOfSquares
+from .forces import ForceOptimum, optimize_forces
 from .grasp import (
     Grasp,
     folded_grasp_map,
@@ -65,6 +67,15 @@ __all__ = [
     "Trace",
     "save_grasp",
     "load_grasp",
+    # 11.3 grasp force optimisation
+    "optimize_forces",
+    "ForceOptimum",
+    "Criterion",
+    "Gentlest",
+    "Robust",
+    "SmallestSum",
+    "SumOfSquares",
+    "LeastNorm",
     # answers and their proofs
     "Status",
     "check_certificate",

@@ -66,6 +66,13 @@ class ContactModel(eqx.Module):
     def lmi_matrices(self, dimension: int) -> Float[Array, "*contacts n q q"]:
         """The S_j of ``P(f) = sum_j f_j S_j >= 0`` (11.9), one stack per contact."""
 
+    @abstractmethod
+    def log_det_terms(self, dimension: int) -> tuple[Array, Array, Array]:
+        """(a, b, c), per contact, of ``log det P(f) = a log f_n + b log(f_n^2 - psi^2) + c`` for (11.4), (11.35).
+
+        Wherever mu = 0, P is the scalar f_n: a = 1, b = c = 0.
+        """
+
     def force_size(self, dimension: int) -> int:
         """n, the number of force components of one contact."""
         return len(self.components(dimension))
@@ -132,6 +139,10 @@ def _arrow_matrices(
     return jnp.stack(matrices, axis=-3)
 
 
+def _where_rough(friction: Array, value: float, otherwise: float) -> Array:
+    return jnp.where(friction > 0, jnp.full_like(friction, value), jnp.full_like(friction, otherwise))
+
+
 class Frictionless(ContactModel):
     """Frictionless point contact: ``f = (f_n)``, ``f_n >= 0``, ``P(f) = f_n``."""
 
@@ -156,6 +167,10 @@ class Frictionless(ContactModel):
 
     def lmi_matrices(self, dimension: int) -> Float[Array, "*contacts 1 1 1"]:
         return jnp.ones((*self.zero.shape, 1, 1, 1), self.zero.dtype)
+
+    def log_det_terms(self, dimension: int) -> tuple[Array, Array, Array]:
+        zero = jnp.zeros_like(self.zero)
+        return zero + 1, zero, zero
 
 
 class HardFinger(ContactModel):
@@ -194,6 +209,12 @@ class HardFinger(ContactModel):
         tangent = jnp.where(mu > 0, jnp.ones_like(mu), jnp.zeros_like(mu))
         diagonal = jnp.where(mu > 0, mu, jnp.ones_like(mu))
         return _arrow_matrices([tangent] * (dimension - 1), diagonal, self.normal_index(dimension))
+
+    def log_det_terms(self, dimension: int) -> tuple[Array, Array, Array]:
+        """``dimension log mu + (dimension - 2) log f_n + log(f_n^2 - psi^2)``."""
+        mu = self.friction
+        safe = jnp.where(mu > 0, mu, jnp.ones_like(mu))
+        return _where_rough(mu, dimension - 2, 1), _where_rough(mu, 1, 0), dimension * jnp.log(safe)
 
 
 class SoftFinger(ContactModel):
@@ -239,3 +260,8 @@ class SoftFinger(ContactModel):
             for c in (self.friction, self.friction, self.torsion)
         ]
         return _arrow_matrices(inverses, jnp.ones_like(self.friction), self.normal_index(dimension))
+
+    def log_det_terms(self, dimension: int) -> tuple[Array, Array, Array]:
+        """``2 log f_n + log(f_n^2 - psi^2)``."""
+        mu = self.friction
+        return _where_rough(mu, 2, 1), _where_rough(mu, 1, 0), jnp.zeros_like(mu)

@@ -12,11 +12,12 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from ._types import Array
 
-__all__ = ["map_selected", "map_tiles", "padded_rows", "tile_width", "to_lanes", "to_rows"]
+__all__ = ["in_chunks", "map_selected", "map_tiles", "padded_rows", "tile_width", "to_lanes", "to_rows"]
 
 Rows = TypeVar("Rows")  # a pytree of arrays (N, ..)
 
@@ -99,3 +100,26 @@ def map_selected(kernel: Callable[[Any], Any], selected: Array, rows: Any, out: 
         return start + jnp.int32(width), updated
 
     return lax.while_loop(pending, one_tile, (jnp.int32(0), out))[1]
+
+
+def in_chunks(solve: Callable[[Any, Array], Any], rows: Any, batch: tuple[int, ...], chunk: int) -> Any:
+    """``solve(rows, count)`` on chunks of one shape, so that every batch size runs one executable; batch axes restored.
+
+    ``rows`` is a pytree of concrete arrays with the batch axes in front; the last chunk is padded with zeros.
+    """
+    flat = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[len(batch) :]), rows)
+    n = _count(flat)
+    results = []
+    for start in range(0, max(n, 1), chunk):
+        count = min(chunk, n - start)
+
+        def part(x: np.ndarray, start: int = start, count: int = count) -> np.ndarray:
+            piece = x[start : start + count]
+            if count == chunk:
+                return piece
+            return np.concatenate([piece, np.zeros((chunk - count, *x.shape[1:]), x.dtype)])
+
+        result = solve(jax.tree.map(part, flat), jnp.int32(count))
+        results.append(jax.tree.map(lambda x, c=count: np.asarray(x)[:c], result))
+    joined = jax.tree.map(lambda *parts: np.concatenate(parts) if parts[1:] else parts[0], *results)
+    return jax.tree.map(lambda x: jnp.asarray(x.reshape((*batch, *x.shape[1:]))), joined)

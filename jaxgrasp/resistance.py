@@ -15,7 +15,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jax.core import Tracer
 from jax.custom_batching import custom_vmap
@@ -25,7 +24,7 @@ from .cones import cone_max, cone_sum
 from .contacts import Component
 from .geometry import wrench_dimension
 from .grasp import Grasp
-from .lanes import map_selected, map_tiles, padded_rows, tile_width, to_lanes, to_rows
+from .lanes import in_chunks, map_selected, map_tiles, padded_rows, tile_width, to_lanes, to_rows
 from .margin import (
     Contacts,
     Folded,
@@ -275,23 +274,10 @@ _solve_chunk = jax.jit(_solve_rows, static_argnames=("plan",))
 
 
 def _solve_on_host(plan: _Plan, contacts: Contacts, tolerance: Array) -> WrenchResistance:
-    """Chunks of one shape, so that every batch size runs the same executable, compiled once."""
-    batch = contacts.active.shape[:-1]
-    rows = [np.asarray(x).reshape(-1, *x.shape[len(batch) :]) for x in contacts]
-    n = len(rows[0])
-    results = []
-    for start in range(0, max(n, 1), CHUNK):
-        count = min(CHUNK, n - start)
-        chunk = []
-        for x in rows:
-            part = x[start : start + count]
-            if count < CHUNK:
-                part = np.concatenate([part, np.zeros((CHUNK - count, *x.shape[1:]), x.dtype)])
-            chunk.append(part)
-        result = _solve_chunk(plan, Contacts(*chunk), jnp.int32(count), tolerance)
-        results.append(jax.tree.map(lambda x, c=count: np.asarray(x)[:c], result))
-    joined = jax.tree.map(lambda *parts: np.concatenate(parts) if parts[1:] else parts[0], *results)
-    return jax.tree.map(lambda x: jnp.asarray(x.reshape((*batch, *x.shape[1:]))), joined)
+    def solve(rows: Contacts, count: Array) -> WrenchResistance:
+        return _solve_chunk(plan, rows, count, tolerance)
+
+    return in_chunks(solve, contacts, contacts.active.shape[:-1], CHUNK)
 
 
 def contacts_of(grasp: Grasp) -> Contacts:

@@ -27,3 +27,18 @@ class Status(SpokenEnum):
             "or no active contact)."
         ),
     )
+    OPTIMAL = 6, "Optimal: the forces balance the load inside every cone, and the bound proves the cost."
+    INFEASIBLE = (
+        7,
+        (
+            "Infeasible: no admissible forces balance the load; along the escape twist the load does work "
+            "that no force can take up."
+        ),
+    )
+    STALLED = (
+        8,
+        (
+            "Stalled: rounding stopped the solver before its gap or a proof of infeasibility; the best forces and "
+            "the gap reached are given."
+        ),
+    )

@@ -18,7 +18,7 @@ from .solver.linear import Vector, matvec, rmatvec
 from .solver.stages import stage
 from .status import Status
 
-__all__ = ["Rank", "Verdict", "judge"]
+__all__ = ["Rank", "Verdict", "judge", "unfold"]
 
 
 class Rank(NamedTuple):
@@ -80,7 +80,7 @@ def _unseen(columns: Cone, xi: Vector) -> Array:
     return jnp.sqrt(cone_sum(inner(x, x)))
 
 
-def _unfold(s: Cone, components: tuple[Component, ...], friction: Array, torsion: Array) -> Array:
+def unfold(s: Cone, components: tuple[Component, ...], friction: Array, torsion: Array) -> Array:
     """``f = (mu s_1, mu s_2, s_0, gamma s_3)`` per contact in the chapter's order, flattened to (k n, L)."""
     tangential = iter(s[1:])
     parts = []
@@ -165,7 +165,7 @@ def judge(
     margin = jnp.where(none, -jnp.inf * one, margin)
     gap = jnp.where(none, jnp.zeros_like(gap), gap)
     nan = jnp.nan * one
-    force = _unfold(s, components, friction, torsion)
+    force = unfold(s, components, friction, torsion)
     force = jnp.where(none, jnp.zeros_like(force), force)
 
     use_null = deficient & ~escapes

@@ -19,6 +19,7 @@ FLOORS = [
     "contacts",
     # the grasp
     "grasp",
+    "criteria",
     "barrier",
     "lmi",
     # the solver: has never heard of grasping
@@ -26,6 +27,10 @@ FLOORS = [
     "solver.linear",
     "solver.program",
     "solver.interior_point",
+    "solver.convex",
+    "solver.blocks",
+    "solver.kkt",
+    "solver.primal_dual",
     "solver",
     # answers and their proofs
     "status",
@@ -36,6 +41,9 @@ FLOORS = [
     "margin",
     "verdict",
     "resistance",
+    "balance",
+    "optimum",
+    "forces",
     "tracing",
     # the roof
     "errors",

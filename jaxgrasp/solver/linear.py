@@ -104,6 +104,32 @@ def solve_transposed(factor: Cholesky, rhs: Vector) -> Vector:
 
 
 @stage
+def solve_lower(factor: Cholesky, rhs: Vector) -> tuple[Vector, Vector]:
+    """x with ``L x = rhs`` as far as L goes, and what is left over where the pivot was rounding."""
+    columns, inverse = factor
+    x, left = list(rhs), []
+    for i in range(len(x)):
+        for q in range(i):
+            x[i] = x[i] - columns[q][i - q] * x[q]
+        left.append(jnp.where(inverse[i] > 0, jnp.zeros_like(x[i]), x[i]))
+        x[i] = x[i] * inverse[i]
+    return tuple(x), tuple(left)
+
+
+@stage
+def null_combination(factor: Cholesky, left: Vector) -> Vector:
+    """v with ``v^T A = 0`` for A = L Q and ``v_i = left_i`` in the rows that depend on those above them."""
+    columns, inverse = factor
+    v = list(left)
+    for i in reversed(range(len(v))):
+        total = jnp.zeros_like(v[i])
+        for q in range(i + 1, len(v)):
+            total = total - columns[i][q - i] * v[q]
+        v[i] = jnp.where(inverse[i] > 0, total * inverse[i], v[i])
+    return tuple(v)
+
+
+@stage
 def inverse_frobenius(factor: Cholesky) -> Array:
     """``|L^-1|_F^2 = trace(M^-1)``, an upper bound of 1 / lambda_min(M); infinite where a pivot was dropped."""
     columns, inverse = factor

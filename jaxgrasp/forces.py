@@ -1,0 +1,351 @@
+"""11.3: with which contact forces, and at what least cost, does a grasp balance a load? With a bound, or a reason why not.
+
+One lane's way: fold and orthonormalise as for wrench resistance; scale the load (``balance.balance``); iterate to the
+optimum or to a proof that there is none (``solver.primal_dual``); read the answer off and bound it
+(``optimum.answer``). Everyone for a few iterations, then the stragglers, then the answers.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+from jax.custom_batching import custom_vmap
+
+from ._types import Array, Float, Int, gap_floor, unit_roundoff
+from .balance import Demand, balance, proves, starting_point
+from .contacts import Component
+from .criteria import Criterion, Gentlest
+from .geometry import wrench_dimension
+from .grasp import Grasp
+from .lanes import in_chunks, map_selected, map_tiles, padded_rows, tile_width, to_lanes, to_rows
+from .margin import Contacts, fold, project
+from .optimum import Answer, answer
+from .resistance import contacts_of
+from .solver import Stop
+from .solver.primal_dual import State, begin, solve
+from .solver.stages import kernel
+
+__all__ = ["ForceOptimum", "optimize_forces"]
+
+FIRST_BUDGET = 11  # iterations before stragglers are gathered
+TOTAL_BUDGET = 60
+CHUNK = 4096  # problems an executable takes at once when called on concrete arrays
+
+
+class ForceOptimum(eqx.Module):
+    """Optimal contact forces and their proofs, with the batch axes in front; forces in N, torques in N m.
+
+    status        int32, a ``Status``: OPTIMAL, INFEASIBLE, STALLED or INVALID
+    force         (*batch, k n) contact after contact in the chapter's component order: they balance the load, each in
+                  its cone; zero where INFEASIBLE
+    cost, bound   the criterion at ``force``, and a proven lower bound of every admissible force's cost; both
+                  infinite where INFEASIBLE
+    escape_twist  (*batch, m) (velocity; angular velocity), unit norm: the proof of INFEASIBLE; else zero
+    load_twist    (*batch, m) derivative of the optimal cost with respect to the wrench: the twist behind ``bound``
+    joint_rates   (*batch, q) multipliers of the torque limits; with them the twists prove what they prove
+    iterations    int32 interior-point iterations spent
+    stop          int32, a ``solver.Stop``: why the iteration ended
+    wrench, criterion, max_normal, torque_limits  the problem, as it was asked
+    """
+
+    status: Int[Array, "*batch"]
+    force: Float[Array, "*batch kn"]
+    cost: Float[Array, "*batch"]
+    bound: Float[Array, "*batch"]
+    escape_twist: Float[Array, "*batch m"]
+    load_twist: Float[Array, "*batch m"]
+    joint_rates: Float[Array, "*batch q"]
+    iterations: Int[Array, "*batch"]
+    stop: Int[Array, "*batch"]
+    wrench: Float[Array, "*batch m"]
+    criterion: Criterion
+    max_normal: Float[Array, "*batch k"] | None
+    torque_limits: tuple[Array, Array] | None
+
+    @property
+    def gap(self) -> Float[Array, "*batch"]:
+        """``cost - bound``: no admissible force is cheaper by more; 0 where INFEASIBLE."""
+        same = self.cost == self.bound  # both may be infinite
+        return jnp.where(same, jnp.zeros_like(self.cost), self.cost - self.bound)
+
+
+class _Plan(NamedTuple):
+    """What is fixed at trace time."""
+
+    components: tuple[Component, ...]
+    dimension: int
+    width: int
+
+
+class _Solved(NamedTuple):
+    """The solver's part of the result, as rows."""
+
+    answer: Answer
+    iterations: Array
+    stop: Array
+
+
+Rows = tuple[Contacts, Demand]
+
+
+def _to_lanes(tree: Any) -> Any:
+    return jax.tree.map(to_lanes, tree)
+
+
+def _to_rows(tree: Any) -> Any:
+    return jax.tree.map(to_rows, tree)
+
+
+def _problem(plan: _Plan, rows: Rows):
+    contacts, demand = rows
+    folded = fold(contacts, plan.components)
+    projection = project(folded)
+    return folded, projection, balance(contacts, folded, projection, demand, plan.components, plan.dimension)
+
+
+def _setup_kernel(plan: _Plan) -> Callable[[Rows], State]:
+    @kernel
+    def run(rows: Rows) -> State:
+        folded, projection, problem = _problem(plan, rows)
+        load = problem.load
+        idle = load.rest if rows[1].criterion.barrier_weight is None else jnp.zeros_like(load.rest)
+        point = starting_point(problem, projection, folded.count)
+        return _to_rows(begin(problem.program, point, ~problem.valid | load.off | idle))
+
+    return run
+
+
+def _iterate_kernel(plan: _Plan) -> Callable[..., State]:
+    @kernel
+    def run(rows: Rows, state: State, budget: Array, tolerance: Array) -> State:
+        *_, problem = _problem(plan, rows)
+        fine = 8 * unit_roundoff(tolerance.dtype)
+        return _to_rows(solve(problem.program, _to_lanes(state), tolerance, proves, budget, fine))
+
+    return run
+
+
+def _answer_kernel(plan: _Plan) -> Callable[..., Answer]:
+    @kernel
+    def run(rows: Rows, state: State, tolerance: Array) -> Answer:
+        contacts, demand = rows
+        folded, projection, problem = _problem(plan, rows)
+        state = _to_lanes(state)
+        result = answer(
+            contacts, folded, projection, problem, demand, state.point, state.ray, state.stop, 4 * tolerance,
+            plan.components, plan.dimension,
+        )  # fmt: skip
+        return _to_rows(result)
+
+    return run
+
+
+def _solve_rows(plan: _Plan, rows: Rows, count: Array, tolerance: Array) -> _Solved:
+    """All sweeps over the first ``count`` of (N, ..) rows; N is a multiple of the tile width."""
+    n, width = rows[0].active.shape[0], plan.width
+    state = map_tiles(_setup_kernel(plan), rows, count, width)
+    iterate = _iterate_kernel(plan)
+
+    def sweep(state: State, steps: int) -> State:
+        def run(tile: tuple[Rows, State]) -> State:
+            return iterate(*tile, jnp.int32(steps), tolerance)
+
+        live = jnp.arange(n, dtype=jnp.int32) < count
+        running = (state.stop == Stop.RUNNING.value) & live
+        return map_selected(run, running, (rows, state), state, width)
+
+    state = sweep(state, FIRST_BUDGET)
+    state = sweep(state, TOTAL_BUDGET - FIRST_BUDGET)
+
+    def read(tile: tuple[Rows, State]) -> Answer:
+        return _answer_kernel(plan)(*tile, tolerance)
+
+    return _Solved(map_tiles(read, (rows, state), count, width), state.iterations, state.stop)
+
+
+def _batched(plan: _Plan) -> Callable[[Rows, Array], _Solved]:
+    """``_solve_rows`` with any number of leading batch axes, folded into rows; ``vmap`` only adds another axis."""
+
+    @custom_vmap
+    def run(rows: Rows, tolerance: Array) -> _Solved:
+        batch = rows[0].active.shape[:-1]
+        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(batch) :]), rows)
+        n = flat[0].active.shape[0]
+        result = _solve_rows(plan, padded_rows(flat, plan.width), jnp.int32(n), tolerance)
+        return jax.tree.map(lambda x: x[:n].reshape(*batch, *x.shape[1:]), result)
+
+    @run.def_vmap
+    def rule(axis_size, in_batched, rows, tolerance):  # pyright: ignore[reportUnusedFunction]
+        batched, tolerance_batched = in_batched
+        if tolerance_batched:
+            raise ValueError("tolerance must be one number for the whole batch, not one per problem")
+        full = jax.tree.map(
+            lambda x, b: x if b else jnp.broadcast_to(x[None], (axis_size, *x.shape)), rows, batched
+        )
+        result = run(full, tolerance)
+        return result, jax.tree.map(lambda _: True, result)
+
+    return run
+
+
+@functools.cache
+def _compiled(plan: _Plan) -> Callable[..., _Solved]:
+    return jax.jit(_batched(plan))
+
+
+_solve_chunk = jax.jit(_solve_rows, static_argnames=("plan",))
+
+
+def _solved(plan: _Plan, rows: Rows, tolerance: Array) -> _Solved:
+    leaves = jax.tree.leaves((rows, tolerance))
+    if any(isinstance(x, Tracer) for x in leaves) or jax.default_backend() != "cpu":
+        return _compiled(plan)(rows, tolerance)
+
+    def run(part: Rows, count: Array) -> _Solved:
+        return _solve_chunk(plan, part, count, tolerance)
+
+    return in_chunks(run, rows, rows[0].active.shape[:-1], CHUNK)
+
+
+# The question --------------------------------------------------------------------------------------------
+
+
+def _number(value: Any, name: str, dtype) -> Array:
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be a number or an array of numbers, got {value!r}") from error
+    if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
+        raise ValueError(f"{name} must hold real numbers, got dtype {array.dtype}")
+    return array.astype(dtype)
+
+
+def _loads(grasp: Grasp, wrench: Any) -> tuple[Array, tuple[int, ...]]:
+    """The wrench with all batch axes, and those axes: the grasp's, then any load axes."""
+    m, batch = wrench_dimension(grasp.dimension), grasp.batch_shape
+    array = _number(wrench, "wrench", grasp.dtype)
+    if array.ndim < 1 or array.shape[-1] != m:
+        raise ValueError(
+            f"wrench must have shape (*batch, *loads, {m}): (force; torque about the centre of mass), got {array.shape}"
+        )
+    lead = array.shape[:-1]
+    if not lead:
+        return jnp.broadcast_to(array, (*batch, m)), batch
+    if len(lead) < len(batch) or any(a not in (1, b) for a, b in zip(lead, batch, strict=False)):
+        raise ValueError(
+            f"the leading axes of wrench {array.shape} must start with the grasp's batch axes {batch} "
+            "(further axes are several loads for each grasp)"
+        )
+    shape = (*batch, *lead[len(batch) :])
+    return jnp.broadcast_to(array, (*shape, m)), shape
+
+
+def _spread(
+    value: Array, own: tuple[int, ...], batch: tuple[int, ...], shape: tuple[int, ...], name: str
+) -> Array:
+    """``value`` with trailing axes ``own`` broadcast over ``batch``, then over the load axes."""
+    loads = len(shape) - len(batch)
+    try:
+        full = jnp.broadcast_to(value, (*batch, *own))
+    except ValueError as error:
+        raise ValueError(f"{name} must broadcast to shape {(*batch, *own)}, got {value.shape}") from error
+    return jnp.broadcast_to(full.reshape(*batch, *([1] * loads), *own), (*shape, *own))
+
+
+def _demand(
+    grasp: Grasp,
+    wrench: Array,
+    shape: tuple[int, ...],
+    criterion: Criterion,
+    max_normal: Any,
+    torque_limits: Any,
+) -> tuple[Contacts, Demand]:
+    batch, k, dtype = grasp.batch_shape, grasp.contacts, grasp.dtype
+    n = grasp.model.force_size(grasp.dimension)
+    contacts = contacts_of(grasp)
+    spread = Contacts(*(_spread(x, x.shape[len(batch) :], batch, shape, "grasp") for x in contacts))
+    criterion = jax.tree.map(
+        lambda x: _spread(x.astype(dtype), (), batch, shape, "the criterion's weight"), criterion
+    )
+    log_det = None
+    if criterion.barrier_weight is not None:
+        terms = grasp.model.log_det_terms(grasp.dimension)
+        a, b, c = (_spread(x.astype(dtype), (k,), batch, shape, "grasp") for x in terms)
+        log_det = (a, b, c)
+    cap = None
+    if max_normal is not None:
+        cap = _spread(_number(max_normal, "max_normal", dtype), (k,), batch, shape, "max_normal")
+    jacobian = torque = None
+    if torque_limits is not None:
+        try:
+            jacobian, torque = torque_limits
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"torque_limits must be a pair (J, tau_max): J of shape (*batch, {k * n}, q) and tau_max (q)"
+            ) from error
+        jacobian = _number(jacobian, "the hand Jacobian J", dtype)
+        if jacobian.ndim < 2 or jacobian.shape[-2] != k * n:
+            raise ValueError(
+                f"the hand Jacobian J must have shape (*batch, {k * n}, q): one row for each force component "
+                f"({k} contacts of {n}), one column for each joint, got {jacobian.shape}"
+            )
+        joints = jacobian.shape[-1]
+        jacobian = _spread(jacobian, (k * n, joints), batch, shape, "the hand Jacobian J")
+        torque = _spread(_number(torque, "tau_max", dtype), (joints,), batch, shape, "tau_max")
+    return spread, Demand(wrench, criterion, log_det, cap, jacobian, torque)
+
+
+def optimize_forces(
+    grasp: Grasp,
+    wrench: Float[Array, "*batch m"],
+    criterion: Criterion | None = None,
+    max_normal: Any = None,
+    torque_limits: tuple[Any, Any] | None = None,
+    tolerance: float = 1e-8,
+) -> ForceOptimum:
+    """The least costly admissible contact forces that balance a load (section 11.3, Definition 5).
+
+        min h(f)   subject to   f_i in C_i,  G f + wrench = 0,  f_n,i <= max_normal_i,  |J^T f| <= tau_max
+
+    grasp          a ``Grasp`` with any batch axes; works under ``jax.jit`` and ``jax.vmap``
+    wrench         (*batch, *loads, m): force in N and torque about the centre of mass in N m that act on the object; (m,)
+                   goes to all grasps, axes after the grasp's own are several loads for each grasp
+    criterion      ``Gentlest()`` (default), ``Robust(weight)``, ``SmallestSum()``, ``SumOfSquares()``, ``LeastNorm(length)``
+    max_normal     N, a number or one per contact, infinite for none
+    torque_limits  (J, tau_max): J (*batch, k n, q) maps joint rates to contact velocities in the contacts' own frames, so
+                   ``J^T f`` are the joint torques (N m) and |J^T f| <= tau_max (q)
+    tolerance      duality gap to reach, relative to the cost
+
+    Returns a ``ForceOptimum``. OPTIMAL comes with forces and a proven bound, INFEASIBLE with an escape twist; a lane
+    without either is STALLED, one with bad numbers INVALID. Nothing raises inside; wrong shapes raise ValueError.
+    Sources: Buss, Hashimoto, Moore 1996; Han, Trinkle, Li 2000; Boyd, Wegbreit 2007.
+    """
+    if not isinstance(grasp, Grasp):
+        raise ValueError(f"optimize_forces takes a jaxgrasp.Grasp, got {type(grasp).__name__}")
+    criterion = Gentlest() if criterion is None else criterion
+    if not isinstance(criterion, Criterion):
+        raise ValueError(f"criterion must be an object such as jaxgrasp.Gentlest(), got {criterion!r}")
+    if isinstance(tolerance, int | float) and not tolerance > 0:
+        raise ValueError(f"tolerance must be positive, got {tolerance}")
+    components = grasp.model.components(grasp.dimension)
+    loads, shape = _loads(grasp, wrench)
+    rows = _demand(grasp, loads, shape, criterion, max_normal, torque_limits)
+    demand = rows[1]
+    joints = 0 if demand.jacobian is None else demand.jacobian.shape[-1]
+    width = tile_width((wrench_dimension(grasp.dimension) + joints) * grasp.contacts * len(components))
+    plan = _Plan(components, grasp.dimension, width)
+    floor = gap_floor(grasp.dtype)
+    goal = jnp.maximum(jnp.asarray(tolerance, grasp.dtype), jnp.asarray(floor, grasp.dtype))
+    solved = _solved(plan, rows, goal)
+    a = solved.answer
+    limits = None if demand.jacobian is None or demand.torque is None else (demand.jacobian, demand.torque)
+    return ForceOptimum(
+        a.status, a.force, a.cost, a.bound, a.escape_twist, a.load_twist, a.joint_rates, solved.iterations,
+        solved.stop, loads, demand.criterion, demand.cap, limits,
+    )  # fmt: skip
