@@ -20,6 +20,7 @@ __all__ = [
     "rank_tolerance",
     "rounding_constant",
     "unit_roundoff",
+    "widest_scaling",
 ]
 
 
@@ -61,6 +62,14 @@ def rank_tolerance(dtype) -> float:
 def pivot_tolerance(dtype) -> float:
     """A Cholesky pivot at or below this times its own diagonal entry is rounding, not information."""
     return 32 * unit_roundoff(dtype)
+
+
+def widest_scaling(dtype) -> float:
+    """Largest squared scaling a derivative's Newton matrix is built with: 1e7 (float64), 1e3 (float32).
+
+    Beyond it, what the matrix must resolve next to its largest entries is lost; refinement makes up for the cut.
+    """
+    return 1e7 if jnp.dtype(dtype).itemsize == 8 else 1e3
 
 
 def rounding_constant() -> float:

@@ -37,6 +37,7 @@ class Demand(NamedTuple):
     wrench    (N, m) in N and N m                 criterion  its weights one per row
     cap       (N, k) largest f_n in N, or None    log_det    (a, b, c), (N, k) each: log det P, or None
     jacobian  (N, k n, q), or None                torque     (N, q) tau_max, or None
+    smoothing (N,) in units of the cost, or None
     """
 
     wrench: Array
@@ -45,6 +46,7 @@ class Demand(NamedTuple):
     cap: Array | None
     jacobian: Array | None
     torque: Array | None
+    smoothing: Array | None = None
 
 
 class Load(NamedTuple):
@@ -139,7 +141,11 @@ def _limits(
 
 
 def torque_rows(
-    demand: Demand, contacts: Contacts, exists: Array, components: tuple[Component, ...]
+    demand: Demand,
+    contacts: Contacts,
+    exists: Array,
+    components: tuple[Component, ...],
+    row_norm: Array | None = None,
 ) -> tuple[Cone, Array, Array]:
     """E with ``E s = J^T f``, normal components first, rows of norm 1; the norms; which lanes are finite."""
     order = sorted(range(len(components)), key=lambda c: components[c] is not Component.NORMAL)
@@ -157,7 +163,7 @@ def torque_rows(
                 rows.append(value)
                 square = square + value * value
             parts.append(rows)
-        norm = jnp.sqrt(square)
+        norm = jnp.sqrt(square) if row_norm is None else row_norm
         usable = jnp.isfinite(norm) & (norm > 0)
         sound = jnp.isfinite(norm[0])
         for j in range(1, norm.shape[0]):
@@ -221,6 +227,59 @@ def _positive_weight(weight: Array) -> tuple[Array, Array]:
     return jnp.where(good, weight, jnp.ones_like(weight)), good
 
 
+def cone_program(
+    contacts: Contacts,
+    exists: Array,
+    columns: Cone,
+    rhs: Array,
+    size: Array,
+    demand: Demand,
+    components: tuple[Component, ...],
+    row_norm: Array | None = None,
+) -> tuple[ConvexProgram, Array | None, Array]:
+    """The program for forces ``size u`` with ``columns u = rhs``; the norms of its torque rows; which limits are numbers.
+
+    ``row_norm`` fixes what the torque rows are divided by.
+    """
+    criterion = demand.criterion
+    sound = exists[0] == exists[0]
+    if demand.jacobian is not None:
+        rows, norm, sound = torque_rows(demand, contacts, exists, components, row_norm)
+        columns, row_norm = _joined(columns, rows), norm
+    cap, bound, good = _limits(
+        None if demand.cap is None else to_lanes(demand.cap),
+        None if demand.torque is None else to_lanes(demand.torque),
+        exists,
+        size,
+        row_norm,
+    )
+    cone_floor = head_floor = None
+    weight = criterion.barrier_weight
+    if weight is not None:
+        assert demand.log_det is not None
+        on_normal, on_cone, _ = (to_lanes(x) for x in demand.log_det)
+        cone_floor, head_floor = _floors(weight, on_normal, on_cone, exists, size)
+    curved = curvature(criterion, contacts, exists, components)
+    program = ConvexProgram(
+        columns,
+        rhs,
+        exists,
+        exists if criterion.price else None,
+        curved,
+        jnp.ones_like(size) if criterion.level else None,
+        cap,
+        bound,
+        cone_floor,
+        head_floor,
+        None if demand.smoothing is None else _per_size(demand.smoothing, size, curved is not None),
+    )
+    return program, row_norm, _all([sound, good])
+
+
+def _per_size(smoothing: Array, size: Array, squared: bool) -> Array:
+    return smoothing / (size * size) if squared else smoothing / size
+
+
 def balance(
     contacts: Contacts,
     folded: Folded,
@@ -230,54 +289,20 @@ def balance(
     dimension: int,
 ) -> Balance:
     """The cone program of a tile."""
-    exists, criterion = folded.exists, demand.criterion
+    criterion = demand.criterion
     sound = [folded.valid]
     for name in ("weight", "length"):
         value = getattr(criterion, name, None)
         if value is not None:
             value, good = _positive_weight(value)
-            criterion = _with_weight(criterion, name, value)
+            criterion = eqx.tree_at(lambda c, name=name: getattr(c, name), criterion, value)
             sound.append(good)
     demand = demand._replace(criterion=criterion)
     loaded, finite = load(folded, projection, demand, dimension)
-    sound.append(finite)
-
-    columns, norm = projection.basis.columns, None
-    if demand.jacobian is not None:
-        rows, norm, good = torque_rows(demand, contacts, exists, components)
-        columns = _joined(columns, rows)
-        sound.append(good)
-    cap, bound, good = _limits(
-        None if demand.cap is None else to_lanes(demand.cap),
-        None if demand.torque is None else to_lanes(demand.torque),
-        exists,
-        loaded.size,
-        norm,
+    program, norm, good = cone_program(
+        contacts, folded.exists, projection.basis.columns, loaded.rhs, loaded.size, demand, components
     )
-    sound.append(good)
-    cone_floor = head_floor = None
-    weight = criterion.barrier_weight
-    if weight is not None:
-        assert demand.log_det is not None
-        on_normal, on_cone, _ = (to_lanes(x) for x in demand.log_det)
-        cone_floor, head_floor = _floors(weight, on_normal, on_cone, exists, loaded.size)
-    program = ConvexProgram(
-        columns,
-        loaded.rhs,
-        exists,
-        exists if criterion.price else None,
-        curvature(criterion, contacts, exists, components),
-        jnp.ones_like(loaded.size) if criterion.level else None,
-        cap,
-        bound,
-        cone_floor,
-        head_floor,
-    )
-    return Balance(program, loaded, _all(sound), norm)
-
-
-def _with_weight(criterion: Criterion, name: str, value: Array) -> Criterion:
-    return eqx.tree_at(lambda c: getattr(c, name), criterion, value)
+    return Balance(program, loaded, _all([*sound, finite, good]), norm)
 
 
 # Where a lane begins ------------------------------------------------------------------------------------

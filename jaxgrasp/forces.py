@@ -27,6 +27,7 @@ from .lanes import in_chunks, map_selected, map_tiles, padded_rows, tile_width, 
 from .margin import Contacts, fold, project
 from .optimum import Answer, answer
 from .resistance import contacts_of
+from .sensitivity import Rows, Solved, differentiable
 from .solver import Stop
 from .solver.primal_dual import State, begin, solve
 from .solver.stages import kernel
@@ -81,17 +82,7 @@ class _Plan(NamedTuple):
     components: tuple[Component, ...]
     dimension: int
     width: int
-
-
-class _Solved(NamedTuple):
-    """The solver's part of the result, as rows."""
-
-    answer: Answer
-    iterations: Array
-    stop: Array
-
-
-Rows = tuple[Contacts, Demand]
+    with_point: bool  # keep the primal-dual point, for derivatives
 
 
 def _to_lanes(tree: Any) -> Any:
@@ -146,7 +137,7 @@ def _answer_kernel(plan: _Plan) -> Callable[..., Answer]:
     return run
 
 
-def _solve_rows(plan: _Plan, rows: Rows, count: Array, tolerance: Array) -> _Solved:
+def _solve_rows(plan: _Plan, rows: Rows, count: Array, tolerance: Array) -> Solved:
     """All sweeps over the first ``count`` of (N, ..) rows; N is a multiple of the tile width."""
     n, width = rows[0].active.shape[0], plan.width
     state = map_tiles(_setup_kernel(plan), rows, count, width)
@@ -166,14 +157,15 @@ def _solve_rows(plan: _Plan, rows: Rows, count: Array, tolerance: Array) -> _Sol
     def read(tile: tuple[Rows, State]) -> Answer:
         return _answer_kernel(plan)(*tile, tolerance)
 
-    return _Solved(map_tiles(read, (rows, state), count, width), state.iterations, state.stop)
+    answers = map_tiles(read, (rows, state), count, width)
+    return Solved(answers, state.iterations, state.stop, state.point if plan.with_point else None)
 
 
-def _batched(plan: _Plan) -> Callable[[Rows, Array], _Solved]:
+def _batched(plan: _Plan) -> Callable[[Rows, Array], Solved]:
     """``_solve_rows`` with any number of leading batch axes, folded into rows; ``vmap`` only adds another axis."""
 
     @custom_vmap
-    def run(rows: Rows, tolerance: Array) -> _Solved:
+    def run(rows: Rows, tolerance: Array) -> Solved:
         batch = rows[0].active.shape[:-1]
         flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(batch) :]), rows)
         n = flat[0].active.shape[0]
@@ -195,19 +187,19 @@ def _batched(plan: _Plan) -> Callable[[Rows, Array], _Solved]:
 
 
 @functools.cache
-def _compiled(plan: _Plan) -> Callable[..., _Solved]:
-    return jax.jit(_batched(plan))
+def _compiled(plan: _Plan) -> Callable[..., Solved]:
+    return jax.jit(differentiable(_batched(plan), plan.components, plan.dimension))
 
 
 _solve_chunk = jax.jit(_solve_rows, static_argnames=("plan",))
 
 
-def _solved(plan: _Plan, rows: Rows, tolerance: Array) -> _Solved:
+def _solved(plan: _Plan, rows: Rows, tolerance: Array) -> Solved:
     leaves = jax.tree.leaves((rows, tolerance))
     if any(isinstance(x, Tracer) for x in leaves) or jax.default_backend() != "cpu":
-        return _compiled(plan)(rows, tolerance)
+        return _compiled(plan._replace(with_point=True))(rows, tolerance)
 
-    def run(part: Rows, count: Array) -> _Solved:
+    def run(part: Rows, count: Array) -> Solved:
         return _solve_chunk(plan, part, count, tolerance)
 
     return in_chunks(run, rows, rows[0].active.shape[:-1], CHUNK)
@@ -308,6 +300,7 @@ def optimize_forces(
     max_normal: Any = None,
     torque_limits: tuple[Any, Any] | None = None,
     tolerance: float = 1e-8,
+    smoothing: float = 0.0,
 ) -> ForceOptimum:
     """The least costly admissible contact forces that balance a load (section 11.3, Definition 5).
 
@@ -321,6 +314,8 @@ def optimize_forces(
     torque_limits  (J, tau_max): J (*batch, k n, q) maps joint rates to contact velocities in the contacts' own frames, so
                    ``J^T f`` are the joint torques (N m) and |J^T f| <= tau_max (q)
     tolerance      duality gap to reach, relative to the cost
+    smoothing      barrier parameter, in units of the cost, at which to stop (default 0: the optimum itself). The forces are
+                   then those of the smooth central path, whose derivatives have no kinks; ``gap`` says what it costs
 
     Returns a ``ForceOptimum``. OPTIMAL comes with forces and a proven bound, INFEASIBLE with an escape twist; a lane
     without either is STALLED, one with bad numbers INVALID. Nothing raises inside; wrong shapes raise ValueError.
@@ -333,13 +328,18 @@ def optimize_forces(
         raise ValueError(f"criterion must be an object such as jaxgrasp.Gentlest(), got {criterion!r}")
     if isinstance(tolerance, int | float) and not tolerance > 0:
         raise ValueError(f"tolerance must be positive, got {tolerance}")
+    if not isinstance(smoothing, int | float) or not smoothing >= 0:
+        raise ValueError(f"smoothing must be a number of at least 0, got {smoothing!r}")
     components = grasp.model.components(grasp.dimension)
     loads, shape = _loads(grasp, wrench)
     rows = _demand(grasp, loads, shape, criterion, max_normal, torque_limits)
     demand = rows[1]
+    if smoothing:
+        demand = demand._replace(smoothing=jnp.full(shape, smoothing, grasp.dtype))
+        rows = (rows[0], demand)
     joints = 0 if demand.jacobian is None else demand.jacobian.shape[-1]
     width = tile_width((wrench_dimension(grasp.dimension) + joints) * grasp.contacts * len(components))
-    plan = _Plan(components, grasp.dimension, width)
+    plan = _Plan(components, grasp.dimension, width, False)
     floor = gap_floor(grasp.dtype)
     goal = jnp.maximum(jnp.asarray(tolerance, grasp.dtype), jnp.asarray(floor, grasp.dtype))
     solved = _solved(plan, rows, goal)

@@ -134,8 +134,11 @@ def _frobenius(columns: Cone) -> Array:
     return jnp.sqrt(total)
 
 
-def fold(contacts: Contacts, components: tuple[Component, ...]) -> Folded:
-    """A of a tile of L rows. Contacts that do not count get zero columns; invalid lanes are all zero."""
+def fold(contacts: Contacts, components: tuple[Component, ...], length: Array | None = None) -> Folded:
+    """A of a tile of L rows. Contacts that do not count get zero columns; invalid lanes are all zero.
+
+    ``length`` (L,) is what lengths are divided by, by default the largest distance of a contact from the origin.
+    """
     position, normal = to_lanes(contacts.position), to_lanes(contacts.normal)
     friction, torsion, active = (
         to_lanes(contacts.friction),
@@ -150,7 +153,7 @@ def fold(contacts: Contacts, components: tuple[Component, ...]) -> Folded:
     valid, live = _screen(*coordinates, friction, torsion, active)
     exists = live.astype(dtype)
     point = tuple(jnp.where(live, position[:, i], jnp.zeros_like(position[:, i])) for i in range(dimension))
-    length = _length(point)
+    length = _length(point) if length is None else length
     point = tuple(x / length for x in point)
     last = [jnp.zeros((), dtype)] * (dimension - 1) + [jnp.ones((), dtype)]
     direction = _unit(tuple(jnp.where(live, normal[:, i], last[i]) for i in range(dimension)))

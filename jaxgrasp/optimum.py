@@ -23,7 +23,7 @@ from .solver.stages import stage
 from .status import Status
 from .verdict import unfold
 
-__all__ = ["Answer", "answer"]
+__all__ = ["Answer", "answer", "criterion_value"]
 
 PROVEN_LIMIT = 1e7  # loads; the checker asks for a tenth of it
 
@@ -79,7 +79,7 @@ def _logs(weight: Array, terms: tuple[Array, Array, Array], exists: Array, u: Co
 
 
 @stage
-def _cost(
+def criterion_value(
     program: ConvexProgram,
     u: Cone,
     size: Array,
@@ -263,7 +263,7 @@ def answer(
     u = _polished(projection.basis.columns, program.rhs, program.exists, point.u)
     weight = demand.criterion.barrier_weight
     terms = None if demand.log_det is None else tuple(to_lanes(x) for x in demand.log_det)
-    cost = _cost(program, u, load.size, weight, terms)
+    cost = criterion_value(program, u, load.size, weight, terms)
 
     rows = _all_rows(point)
     pull = _pull(program, rows)

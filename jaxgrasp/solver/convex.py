@@ -88,6 +88,7 @@ class ConvexProgram(NamedTuple):
     level       (L,): g, or None           cap        (k, L), infinite where there is none, or None
     bound       (q, L), or None
     cone_floor  (k, L): phi, or None       head_floor (k, L): psi, or None (both or neither)
+    smoothing   (L,): a floor under every product, or None; the solution is then a point of the central path
     """
 
     columns: Cone
@@ -100,6 +101,7 @@ class ConvexProgram(NamedTuple):
     bound: Array | None
     cone_floor: Array | None
     head_floor: Array | None
+    smoothing: Array | None = None
 
     def masks(self) -> Bounds:
         """Ones where an inequality exists."""
@@ -113,8 +115,18 @@ class ConvexProgram(NamedTuple):
     def floors(self) -> Bounds:
         """What each slack times its price aims at."""
         masks = self.masks()
-        zero = Bounds(*(None if m is None else jnp.zeros_like(m) for m in masks))
-        return zero if self.head_floor is None else zero._replace(head=self.head_floor)
+        base = Bounds(*(None if m is None else jnp.zeros_like(m) for m in masks))
+        if self.head_floor is not None:
+            base = base._replace(head=self.head_floor)
+        if self.smoothing is None:
+            return base
+        return Bounds(*(None if b is None else b + self.smoothing for b in base))
+
+    def cone_target(self) -> Array | None:
+        """What <u_i, z_i> aims at, or None for 0."""
+        if self.smoothing is None:
+            return self.cone_floor
+        return self.exists * self.smoothing if self.cone_floor is None else self.cone_floor + self.smoothing
 
     def products(self, u: Cone) -> tuple[Array, Array | None]:
         """``B u`` and ``E u``."""

@@ -119,12 +119,13 @@ def rejoined(x: Cone) -> Cone:
 def _measure(program: ConvexProgram, u: Cone, z: Cone, slack: Bounds, price: Bounds) -> tuple[Array, Array]:
     """Sum of ``|product - floor|`` over all inequalities, and their number."""
     product = inner(u, z)
-    if program.cone_floor is not None:
-        product = jnp.abs(product - program.cone_floor)
+    floor = program.cone_target()
+    if floor is not None:
+        product = jnp.abs(product - floor)
     total, count = cone_sum(program.exists * product), cone_sum(program.exists)
-    for mask, floor, a, b in zip(program.masks(), program.floors(), slack, price, strict=True):
+    for mask, least, a, b in zip(program.masks(), program.floors(), slack, price, strict=True):
         if mask is not None:
-            total = total + cone_sum(mask * jnp.abs(a * b - floor))
+            total = total + cone_sum(mask * jnp.abs(a * b - least))
             count = count + cone_sum(mask)
     return total, count
 
@@ -165,7 +166,8 @@ def _aims(
 ) -> tuple[Cone, Bounds]:
     """Targets of the products: floor + mu, less ``weight`` times the predictor's second-order error."""
     zero = jnp.zeros_like(program.exists)
-    first = zero + mu if program.cone_floor is None else program.cone_floor + mu
+    floor = program.cone_target()
+    first = zero + mu if floor is None else floor + mu
     cone: Cone = (first, *(zero for _ in program.columns[1:]))
     scalar = _map(lambda floor: floor + mu, local.floors)
     if affine is not None:
@@ -314,7 +316,7 @@ def newton_step(program: ConvexProgram, point: Point, excess: Array, closed: Arr
     after, count = _measure(program, ahead.u, ahead.z, ahead.slack, ahead.price)
     mu, share, drive, fraction = _centring(excess, after, count, closed)
     # Far from a fixed barrier's floor the full second-order correction overshoots.
-    weight = one if program.cone_floor is None else length
+    weight = one if program.cone_floor is None and program.smoothing is None else length
     step, reach = direction(mu, share, drive, weight, affine)
     return _moved(point, step, _length(reach, fraction)), step
 

@@ -15,20 +15,35 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 import jax
+from jax import lax
 from jax.core import eval_jaxpr
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.interpreters import partial_eval
 
-__all__ = ["kernel", "stage"]
+__all__ = ["inlined", "kernel", "stage"]
 
 SWITCH = "JAXGRASP_KERNELS"
 
+_INLINED: ContextVar[bool] = ContextVar("stages are plain functions here", default=False)
+
 _KEPT = {"inlineable": "false"}
 _SMALL = {"inlineable": "false", "xla_cpu_small_call": "true"}
+
+
+@contextmanager
+def inlined() -> Iterator[None]:
+    """Stages traced inside are plain functions, which JAX differentiates, batches and transposes as it likes."""
+    token = _INLINED.set(True)
+    try:
+        yield
+    finally:
+        _INLINED.reset(token)
 
 
 def _called(function: Callable, attributes: dict[str, str]) -> Callable:
@@ -39,7 +54,12 @@ def _called(function: Callable, attributes: dict[str, str]) -> Callable:
 
     @functools.wraps(function)
     def wrapper(*args: Any) -> Any:
-        if jax.default_backend() != "cpu" or os.environ.get(SWITCH, "on").lower() == "off":
+        if _INLINED.get():
+            return function(*args)
+        if jax.default_backend() != "cpu":
+            # Fusions that compute a value twice round it twice, and a step that was checked is then not the step taken.
+            return lax.optimization_barrier(function(*args))
+        if attributes is _SMALL and os.environ.get(SWITCH, "on").lower() == "off":
             return function(*args)
         closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
         live, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))

@@ -1,0 +1,259 @@
+"""Derivatives of optimal costs and forces with respect to everything that is asked (theory section 3).
+
+    d cost  = derivative of the Lagrangian in the data, the solution fixed       (envelope theorem, no linear solve)
+    d force = one solve with the Newton matrix at the solution                   (implicit function theorem)
+
+A ``custom_jvp`` whose rule calls the same function again, so gradients, Hessians and every nesting are exact. The load's
+size, the length L and the factor of A only scale the problem; the rule holds them fixed. Lanes without an optimum, and
+lanes without a load, have derivative 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from ._types import Array
+from .balance import Demand, balance, cone_program
+from .cones import Cone, cone_sum
+from .contacts import Component
+from .lanes import to_lanes, to_rows
+from .margin import Contacts, fold, project
+from .optimum import Answer, criterion_value
+from .solver import Stop
+from .solver.convex import ConvexProgram, Point, as_vector
+from .solver.implicit import lagrangian, point_tangent, residuals
+from .solver.linear import Cholesky, Vector, solve_lower, solve_transposed
+from .solver.stages import inlined
+from .status import Status
+from .verdict import unfold
+
+__all__ = ["Solved", "differentiable"]
+
+Rows = tuple[Contacts, Demand]
+
+
+class Solved(NamedTuple):
+    """The solver's part of a result, as rows; ``point`` only where derivatives may be wanted."""
+
+    answer: Answer
+    iterations: Array
+    stop: Array
+    point: Point | None
+
+
+class Scales(NamedTuple):
+    """What the scaled problem was divided by: constants of the derivative. Lanes last."""
+
+    length: Array
+    size: Array
+    factor: Cholesky
+    row_norm: Array | None
+
+
+def _scales(rows: Rows, components: tuple[Component, ...], dimension: int) -> Scales:
+    contacts, demand = lax.stop_gradient(rows)
+    folded = fold(contacts, components)
+    projection = project(folded)
+    problem = balance(contacts, folded, projection, demand, components, dimension)
+    scales = Scales(folded.length, problem.load.size, projection.factor, problem.row_norm)
+    return lax.stop_gradient(scales)
+
+
+def _program(rows: Rows, scales: Scales, components: tuple[Component, ...], dimension: int) -> ConvexProgram:
+    """The scaled program as a differentiable function of the data."""
+    contacts, demand = rows
+    folded = fold(contacts, components, scales.length)
+    m = folded.columns[0].shape[0]
+    columns = tuple(
+        jnp.stack(solve_lower(scales.factor, tuple(c[i] for i in range(m)))[0]) for c in folded.columns
+    )
+    wrench = to_lanes(demand.wrench)
+    outer = tuple(wrench[i] if i < dimension else wrench[i] / scales.length for i in range(m))
+    inner, _ = solve_lower(scales.factor, outer)
+    rhs = jnp.stack([-x / scales.size for x in inner])
+    program, _, _ = cone_program(
+        contacts, folded.exists, columns, rhs, scales.size, demand, components, scales.row_norm
+    )
+    return program
+
+
+def _safe(ok: Array, rows: Rows, dimension: int) -> Rows:
+    """``rows`` with harmless numbers in the lanes without a derivative, so that no NaN enters, forwards or backwards."""
+    contacts, demand = rows
+
+    def keep(x: Array, value: Any) -> Array:
+        mask = ok.reshape(*ok.shape, *([1] * (x.ndim - 1)))
+        return jnp.where(mask, x, jnp.asarray(value, x.dtype))
+
+    axis = np.eye(dimension)[-1]
+    plain = Contacts(
+        keep(contacts.position, axis), keep(contacts.normal, axis), keep(contacts.friction, 1.0),
+        keep(contacts.torsion, 1.0), keep(contacts.active, True),
+    )  # fmt: skip
+    asked = Demand(
+        keep(demand.wrench, 0.0),
+        jax.tree.map(lambda x: keep(x, 1.0), demand.criterion),
+        jax.tree.map(lambda x: keep(x, 1.0), demand.log_det),
+        None if demand.cap is None else keep(demand.cap, np.inf),
+        None if demand.jacobian is None else keep(demand.jacobian, 0.0),
+        None if demand.torque is None else keep(demand.torque, 1.0),
+        None if demand.smoothing is None else keep(demand.smoothing, 1.0),
+    )
+    # Padded contacts may hold anything.
+    live = plain.active
+    point = live[..., None]
+    plain = plain._replace(
+        position=jnp.where(point, plain.position, jnp.asarray(axis, plain.position.dtype)),
+        normal=jnp.where(point, plain.normal, jnp.asarray(axis, plain.normal.dtype)),
+        friction=jnp.where(live, plain.friction, jnp.ones_like(plain.friction)),
+        torsion=jnp.where(live, plain.torsion, jnp.ones_like(plain.torsion)),
+    )
+    return plain, asked
+
+
+def _safe_point(ok: Array, point: Point) -> Point:
+    """An interior point in the lanes without a derivative; lanes last."""
+
+    def keep(x: Array, value: float) -> Array:
+        return jnp.where(ok, x, jnp.full_like(x, value))
+
+    def cone(x: Cone) -> Cone:
+        return (keep(x[0], 1.0), *(keep(t, 0.0) for t in x[1:]))
+
+    ones = jax.tree.map(lambda x: keep(x, 1.0), (point.slack, point.price))
+    xi = None if point.xi is None else keep(point.xi, 2.0)
+    return Point(keep(point.y, 0.0), xi, cone(point.u), cone(point.z), *ones)
+
+
+class _View(NamedTuple):
+    """The differentiable outputs of a lane, lanes last."""
+
+    force: Array
+    twist: Array
+    rates: Array
+    cost: Array
+
+
+def _view(
+    rows: Rows, scales: Scales, point: Point, components: tuple[Component, ...], dimension: int
+) -> _View:
+    """Forces, multipliers and the criterion's value, as functions of the data and the point."""
+    contacts, demand = rows
+    friction, torsion = to_lanes(contacts.friction), to_lanes(contacts.torsion)
+    force = unfold(tuple(scales.size * x for x in point.u), components, friction, torsion)
+    program = _program(rows, scales, components, dimension)
+    squared = program.curvature is not None
+    back = scales.size if squared else jnp.ones_like(scales.size)
+    y: Vector = solve_transposed(scales.factor, as_vector(point.y))
+    twist = jnp.stack([back * (x if i < dimension else x / scales.length) for i, x in enumerate(y)])
+    rates = jnp.zeros((0, *scales.size.shape), force.dtype)
+    if scales.row_norm is not None:
+        assert point.price.upper is not None and point.price.lower is not None
+        rates = back * (point.price.upper - point.price.lower) / scales.row_norm
+    weight = demand.criterion.barrier_weight
+    terms = None if demand.log_det is None else tuple(to_lanes(x) for x in demand.log_det)
+    cost = criterion_value(program, point.u, scales.size, weight, terms)
+    return _View(force, twist, rates, cost)
+
+
+def _value(rows: Rows, scales: Scales, point: Point, components: tuple[Component, ...], dimension: int) -> Array:
+    """The Lagrangian in the caller's units, the point fixed."""
+    demand = rows[1]
+    program = _program(rows, scales, components, dimension)
+    total = scales.size * lagrangian(program, point)
+    if program.curvature is not None:
+        total = total * scales.size
+    weight = demand.criterion.barrier_weight
+    if weight is not None and demand.log_det is not None:
+        a, b, c = (to_lanes(x) for x in demand.log_det)
+        logs = cone_sum(program.exists * ((a + 2 * b) * jnp.log(scales.size) + c))
+        total = total - weight * logs
+    return total
+
+
+def _zero_tangent(x: Array) -> Any:
+    if jnp.issubdtype(x.dtype, jnp.floating):
+        return jnp.zeros_like(x)
+    return np.zeros(x.shape, jax.dtypes.float0)
+
+
+def differentiable(
+    solve: Callable[[Rows, Array], Solved], components: tuple[Component, ...], dimension: int
+) -> Callable[[Rows, Array], Solved]:
+    """``solve`` with derivatives of cost, bound, force, load_twist and joint_rates in all float rows."""
+
+    @jax.custom_jvp
+    def run(rows: Rows, tolerance: Array) -> Solved:
+        return solve(rows, tolerance)
+
+    @run.defjvp
+    def rule(primals, tangents):  # pyright: ignore[reportUnusedFunction]
+        rows, tolerance = primals
+        result = run(rows, tolerance)
+        with inlined():
+            change = _tangents(result, rows, tangents[0], components, dimension)
+        return result, change
+
+    return run
+
+
+def _tangents(
+    result: Solved, rows: Rows, change: Rows, components: tuple[Component, ...], dimension: int
+) -> Solved:
+    batch = result.answer.status.shape
+    count = math.prod(batch)
+    zero = jax.tree.map(_zero_tangent, result)
+
+    def flat(x: Any) -> Any:
+        return x.reshape(count, *x.shape[len(batch) :])
+
+    data = jax.tree.map(flat, rows)
+    changes = jax.tree.map(flat, change)
+    answer = jax.tree.map(flat, result.answer)
+    assert result.point is not None
+    stop, point = flat(result.stop), jax.tree.map(lambda x: to_lanes(flat(x)), result.point)
+    ok = (answer.status == Status.OPTIMAL.value) & (stop != Stop.SKIPPED.value)
+
+    data = _safe(ok, data, dimension)
+    changes = jax.tree.map(lambda x, dx: _masked(ok, x, dx), data, changes)
+    point = _safe_point(ok, point)
+    scales = _scales(data, components, dimension)
+
+    program = _program(data, scales, components, dimension)
+    _, residual = jax.jvp(
+        lambda r: residuals(_program(r, scales, components, dimension), point), (data,), (changes,)
+    )
+    moved = point_tangent(program, point, residual)
+    _, seen = jax.jvp(
+        lambda r, p: _view(r, scales, p, components, dimension), (data, point), (changes, moved)
+    )
+    if data[1].smoothing is None:
+        _, cost = jax.jvp(lambda r: _value(r, scales, point, components, dimension), (data,), (changes,))
+    else:
+        cost = seen.cost
+
+    def back(x: Array) -> Array:
+        x = jnp.where(ok, x, jnp.zeros_like(x))
+        return to_rows(x).reshape(*batch, *x.shape[:-1])
+
+    cost = back(cost)
+    answer_change = zero.answer._replace(
+        force=back(seen.force), cost=cost, bound=cost, load_twist=back(seen.twist), joint_rates=back(seen.rates)
+    )
+    point_change = jax.tree.map(back, moved)
+    return zero._replace(answer=answer_change, point=point_change)
+
+
+def _masked(ok: Array, x: Array, dx: Any) -> Any:
+    if not jnp.issubdtype(x.dtype, jnp.floating):
+        return dx
+    mask = ok.reshape(*ok.shape, *([1] * (x.ndim - 1)))
+    return jnp.where(mask, dx, jnp.zeros_like(dx))
+
