@@ -3,8 +3,8 @@
     min h(f)   subject to   G f + w = 0,  f_i in C_i,  f_n,i <= max_i,  |J^T f| <= tau_max
 
 In folded forces s (f = mu s, gamma s, s) with lengths over L this is ``A s = -w``, one unit cone per contact. With
-A = L_A Q, Q of orthonormal rows, and the load scaled to ``size``: ``Q u = b = -L_A^-1 w / size``, ``s = size u``. Rows of
-A that depend on others drop out; a load outside their range is refuted by linear algebra alone.
+A = L_A Q, Q of orthonormal rows, and the load scaled to ``size``: ``Q u = b = -L_A^-1 w / size``, ``s = size u``. Rows
+of A that depend on others drop out; a load outside their range is refuted by linear algebra alone.
 """
 
 from __future__ import annotations
@@ -237,7 +237,7 @@ def cone_program(
     components: tuple[Component, ...],
     row_norm: Array | None = None,
 ) -> tuple[ConvexProgram, Array | None, Array]:
-    """The program for forces ``size u`` with ``columns u = rhs``; the norms of its torque rows; which limits are numbers.
+    """The program for forces ``size u``, ``columns u = rhs``; the norms of its torque rows; which limits are numbers.
 
     ``row_norm`` fixes what the torque rows are divided by.
     """
@@ -371,7 +371,7 @@ def starting_point(balance: Balance, projection: Projection, count: Array) -> Po
 
 @stage
 def power_left(program: ConvexProgram, rows: Array, limit: float) -> Array:
-    """``y.w - sum_i min(cap_i, limit) viol_i - |beta|.bound`` over ``y.w``, with x = A^T y + E^T beta, viol = (|x_t| - x_0)+.
+    """``y.w - sum_i min(cap_i, limit) (|x_t,i| - x_0,i)+ - |beta|.bound`` over ``y.w``, x = A^T y + E^T beta.
 
     Positive, with y.w > 0: the load does more work along the twist y (the joints moving at beta) than forces up to
     ``limit`` times the load and torques up to their bounds can take up. Without limits: ``A_i^T y`` is in every cone.

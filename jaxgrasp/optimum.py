@@ -17,7 +17,7 @@ from .contacts import Component
 from .lanes import to_lanes
 from .margin import Contacts, Folded, Projection, to_twist
 from .solver import Stop
-from .solver.convex import Bounds, ConvexProgram, Curvature, Point, as_vector
+from .solver.convex import ConvexProgram, Curvature, Point, as_vector
 from .solver.linear import Vector, matvec, rmatvec
 from .solver.stages import stage
 from .status import Status
@@ -116,23 +116,41 @@ def _pull(program: ConvexProgram, rows: Array) -> Pull:
     return Pull(rmatvec(program.columns, as_vector(rows)), gain)
 
 
+def _covered(short: Array, cap: Array | None, total: Array) -> Array:
+    """The part of ``short`` (k, L) that multipliers of sum ``total`` should cover: the dearest caps first."""
+    k = short.shape[0]
+    rows = []
+    for i in range(k):
+        before = jnp.zeros_like(total)
+        for j in range(k):
+            if j == i:
+                continue
+            if cap is None:
+                first = j < i
+                before = before + (short[j] if first else jnp.zeros_like(total))
+            else:
+                first = (cap[j] > cap[i]) | ((cap[j] == cap[i]) & (j < i))
+                before = before + jnp.where(first, short[j], jnp.zeros_like(total))
+        left = jnp.maximum(total - before, jnp.zeros_like(total))
+        rows.append(jnp.minimum(left, short[i]))
+    return jnp.stack(rows)
+
+
 @stage
-def _linear_bound(program: ConvexProgram, pull: Pull, level: Array | None) -> Array:
+def _linear_bound(program: ConvexProgram, pull: Pull) -> Array:
     """Dual value of prices and levels: the better of the twist as it is, paying caps, and the twist scaled to need none."""
     exists, x = program.exists, pull.x
     zero = jnp.zeros_like(exists)
     short = exists * jnp.maximum(tail_norm(x) - x[0], zero)
     if program.price is not None:
-        share = program.price
-        largest = cone_max(jnp.where(exists > 0, short, zero))
+        covered = jnp.minimum(short, program.price)
+        largest = cone_max(short)
     else:
-        assert level is not None
-        share = exists * level
-        share = share / cone_sum(share)
+        covered = _covered(short, program.cap, jnp.ones_like(short[0]))
         largest = cone_sum(short)
     needed = jnp.where(largest > 0, largest, jnp.ones_like(largest))
-    scaled = pull.gain / needed
-    over = jnp.maximum(short - share, zero)
+    scaled = jnp.where(largest > 0, pull.gain / needed, jnp.zeros_like(largest))
+    over = short - covered
     cap = jnp.full_like(over, jnp.inf) if program.cap is None else program.cap
     paid = cone_sum(jnp.where(over > 0, over * cap, zero))
     return jnp.maximum(jnp.maximum(scaled, pull.gain - paid), jnp.zeros_like(scaled))
@@ -156,30 +174,35 @@ def _quadratic_bound(program: ConvexProgram, pull: Pull, u: Cone) -> Array:
 
 
 @stage
-def _barrier_bound(
-    program: ConvexProgram, pull: Pull, level: Array, cap: Array | None, u: Cone, price: Array
-) -> Array:
-    """Dual value of the fixed barriers: ``sum phi - phi log phi + phi/2 log det z + psi - psi log psi + psi log p``."""
+def _barrier_bound(program: ConvexProgram, pull: Pull, u: Cone) -> Array:
+    """Dual value of the fixed barriers: ``sum phi - phi log phi + phi/2 log det z + psi - psi log psi + psi log p``.
+
+    p and z are those of the forces u; the level's multipliers, of sum 1, supply what z lacks, the dearest caps first.
+    """
     exists, x = program.exists, pull.x
-    assert program.cone_floor is not None and program.head_floor is not None
-    share = exists * level
-    share = share / cone_sum(share)
-    paid = jnp.zeros_like(exists[0])
-    if cap is not None and program.cap is not None:
-        has = jnp.isfinite(program.cap) & (exists > 0)
-        cap = jnp.where(has, cap, jnp.zeros_like(cap))
-        share = share + cap
-        paid = cone_sum(cap * jnp.where(has, program.cap, jnp.zeros_like(cap)))
-    head = x[0] + share - price
-    z = (jnp.where(exists > 0, head, jnp.ones_like(head)), *(exists * v for v in x[1:]))
-    inside = interior_distance(z)
     phi, psi = program.cone_floor, program.head_floor
-    value = _conjugate(phi, jnp.where(inside > 0, determinant(z), jnp.zeros_like(head)), 0.5) + _conjugate(
-        psi, price, 1.0
-    )
+    assert phi is not None and psi is not None
+    zero, one = jnp.zeros_like(exists), jnp.ones_like(exists)
+    det = jnp.where((exists > 0) & (phi > 0), determinant(u), one)
+    price = jnp.where(exists > 0, psi / jnp.where(exists > 0, u[0], one), zero)
+    tail = tail_norm(x)
+    wanted = jnp.where(phi > 0, phi * u[0] / det, tail)
+    needed = exists * jnp.maximum(wanted + price - x[0], zero)
+    share = _covered(needed, program.cap, one[0])
+    paid, over = jnp.zeros_like(one[0]), zero
+    if program.cap is not None:
+        finite = jnp.isfinite(program.cap) & (exists > 0)
+        over = jnp.where(finite, needed - share, zero)
+        paid = cone_sum(over * jnp.where(finite, program.cap, zero))
+    spare = jnp.maximum(one[0] - cone_sum(share), zero[0]) / cone_sum(exists)
+    head = share + exists * spare + over + x[0] - price
+    z = (jnp.where(exists > 0, head, one), *(exists * v for v in x[1:]))
+    inside = interior_distance(z)
+    value = _conjugate(phi, jnp.where(inside > 0, determinant(z), zero), 0.5) + _conjugate(psi, price, 1.0)
     # A contact without barrier only needs z in its cone.
-    value = jnp.where((phi == 0) & (inside < 0), jnp.full_like(value, -jnp.inf), value)
-    return pull.gain - paid + cone_sum(jnp.where(exists > 0, value, jnp.zeros_like(value)))
+    blur = 4 * unit_roundoff(one.dtype) * (1 + tail)
+    value = jnp.where((phi == 0) & (inside < -blur), jnp.full_like(value, -jnp.inf), value)
+    return pull.gain - paid + cone_sum(jnp.where(exists > 0, value, zero))
 
 
 def _conjugate(floor: Array, value: Array, power: float) -> Array:
@@ -270,10 +293,10 @@ def answer(
     if program.curvature is not None:
         bound = _by_square(_quadratic_bound(program, pull, u), load.size)
     elif program.head_floor is None:
-        bound = _by(_linear_bound(program, pull, point.price.level), load.size)
+        bound = _by(_linear_bound(program, pull), load.size)
     else:
-        assert point.price.level is not None and point.price.head is not None and terms is not None
-        raw = _barrier_bound(program, pull, point.price.level, point.price.cap, u, point.price.head)
+        assert weight is not None and terms is not None
+        raw = _barrier_bound(program, pull, u)
         bound = _shifted(raw, weight, terms, program.exists, load.size)
     scale = _scale(program, point, load.size)
     short = _shortfall(program, u)
@@ -289,8 +312,8 @@ def answer(
     multiplier = to_twist(projection, as_vector(rows[:m]))
     load = load._replace(rest=_both(load.rest, weight is None))
     return _read_back(
-        status, u, cost, bound, escape, multiplier, rows, ray, folded, load, problem.row_norm, point.price,
-        contacts, components, dimension, program.curvature is not None,
+        status, u, cost, bound, escape, multiplier, rows, ray, folded, load, problem.row_norm, contacts,
+         components, dimension, program.curvature is not None,
     )  # fmt: skip
 
 
@@ -320,7 +343,7 @@ def _scale(program: ConvexProgram, point: Point, size: Array) -> Array:
 
 
 def _read_back(
-    status, u, cost, bound, escape, multiplier, rows, ray, folded, load, row_norm, price: Bounds, contacts,
+    status, u, cost, bound, escape, multiplier, rows, ray, folded, load, row_norm, contacts,
     components, dimension: int, squared: bool,
 ) -> Answer:  # fmt: skip
     """Newtons and metres; zeros, infinities and NaN where the status says so."""

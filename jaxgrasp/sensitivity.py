@@ -163,7 +163,9 @@ def _view(
     return _View(force, twist, rates, cost)
 
 
-def _value(rows: Rows, scales: Scales, point: Point, components: tuple[Component, ...], dimension: int) -> Array:
+def _value(
+    rows: Rows, scales: Scales, point: Point, components: tuple[Component, ...], dimension: int
+) -> Array:
     """The Lagrangian in the caller's units, the point fixed."""
     demand = rows[1]
     program = _program(rows, scales, components, dimension)
@@ -245,7 +247,11 @@ def _tangents(
 
     cost = back(cost)
     answer_change = zero.answer._replace(
-        force=back(seen.force), cost=cost, bound=cost, load_twist=back(seen.twist), joint_rates=back(seen.rates)
+        force=back(seen.force),
+        cost=cost,
+        bound=cost,
+        load_twist=back(seen.twist),
+        joint_rates=back(seen.rates),
     )
     point_change = jax.tree.map(back, moved)
     return zero._replace(answer=answer_change, point=point_change)
@@ -256,4 +262,3 @@ def _masked(ok: Array, x: Array, dx: Any) -> Any:
         return dx
     mask = ok.reshape(*ok.shape, *([1] * (x.ndim - 1)))
     return jnp.where(mask, dx, jnp.zeros_like(dx))
-

@@ -1,0 +1,113 @@
+"""What every proof starts from: the grasp map rebuilt in float64 from positions, normals, mu and gamma; numpy only."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+__all__ = ["EPS", "RANK_TOLERANCE", "ROUNDING", "Rebuilt", "rebuild", "scaled_force"]
+
+ROUNDING = 16.0  # c
+RANK_TOLERANCE = 64.0  # in units of eps of the grasp's dtype, relative to the largest singular value
+EPS = float(np.finfo(np.float64).eps)
+
+
+def _frame(normal: np.ndarray) -> list[np.ndarray]:
+    """Tangents of the convention the forces are written in (Duff et al. 2017; planar: t x n = +z)."""
+    if normal.shape[-1] == 2:
+        return [np.stack([normal[..., 1], -normal[..., 0]], -1)]
+    x, y, z = np.moveaxis(normal, -1, 0)
+    sign = np.where(z >= 0, 1.0, -1.0)
+    a = -1 / (sign + z)
+    b = x * y * a
+    return [
+        np.stack([1 + sign * x * x * a, sign * b, -sign * x], -1),
+        np.stack([b, sign + y * y * a, -y], -1),
+    ]
+
+
+def _cross(p: np.ndarray, f: np.ndarray) -> np.ndarray:
+    if p.shape[-1] == 2:
+        return (p[..., 0] * f[..., 1] - p[..., 1] * f[..., 0])[..., None]
+    return np.cross(p, f)
+
+
+def _folded(position, normal, friction, torsion, components) -> np.ndarray:
+    """Contact blocks (lanes, k, m, n) with the normal column first and the coefficients folded in."""
+    tangents = _frame(normal)
+    columns = [np.concatenate([normal, _cross(position, normal)], -1)]
+    for name in components:
+        if name in ("f_x", "f_y"):
+            d = friction[..., None] * tangents[("f_x", "f_y").index(name)]
+            columns.append(np.concatenate([d, _cross(position, d)], -1))
+        elif name == "tau_n":
+            columns.append(np.concatenate([np.zeros_like(normal), torsion[..., None] * normal], -1))
+    return np.stack(columns, -1)
+
+
+def scaled_force(force, scale, normal_index) -> np.ndarray:
+    """s with f = scale * s, normal first; infinite where a component is asked for that does not exist."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s = np.where(force == 0, 0.0, force / scale)
+    tangential = np.delete(s, normal_index, -1)
+    return np.concatenate([s[..., normal_index : normal_index + 1], tangential], -1)
+
+
+class Rebuilt(NamedTuple):
+    """The lanes of a grasp in float64, harmless numbers in lanes and contacts that do not count.
+
+    valid (N,), live (N, k): what counts            length (N,): L          friction, torsion (N, k)
+    blocks (N, k, m, n): folded maps, lengths over L, normal column first    A (N, m, k n): the same, side by side
+    scale (N, k, n): f = scale s, in the order of the components            components, normal_index
+    """
+
+    valid: np.ndarray
+    live: np.ndarray
+    length: np.ndarray
+    friction: np.ndarray
+    torsion: np.ndarray
+    blocks: np.ndarray
+    A: np.ndarray
+    scale: np.ndarray
+    components: list[str]
+    normal_index: int
+
+
+def rebuild(grasp) -> Rebuilt:
+    """The folded grasp map of every lane, from the numbers that define the grasp."""
+    k, dimension = grasp.position.shape[-2], grasp.position.shape[-1]
+    m = 3 if dimension == 2 else 6
+    components = [c.value for c in grasp.model.components(dimension)]
+    n, normal_index = len(components), components.index("f_n")
+
+    def lanes(array, *shape):
+        return np.asarray(array).reshape(-1, *shape)
+
+    position = lanes(grasp.position, k, dimension).astype(np.float64)
+    normal = lanes(grasp.normal, k, dimension).astype(np.float64)
+    friction = lanes(grasp.model.friction_coefficient, k).astype(np.float64)
+    torsion = lanes(grasp.model.torsion_coefficient, k).astype(np.float64)
+    active = lanes(grasp.active, k)
+    with np.errstate(all="ignore"):
+        size = np.max(np.abs(normal), -1)
+        usable = np.isfinite(position).all(-1) & np.isfinite(normal).all(-1) & (size > 0)
+        usable &= np.isfinite(friction) & np.isfinite(torsion) & (friction >= 0) & (torsion >= 0)
+        valid = (usable | ~active).all(-1) & active.any(-1)
+        live = active & valid[:, None]
+        normal = np.where(
+            live[..., None], normal / np.where(size > 0, size, 1.0)[..., None], np.eye(dimension)[-1]
+        )
+        normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+    position = np.where(live[..., None], position, 0.0)
+    friction, torsion = np.where(live, friction, 0.0), np.where(live, torsion, 0.0)
+    length = np.max(np.linalg.norm(position, axis=-1), -1)
+    length = np.where(length > 0, length, 1.0)
+    blocks = _folded(
+        position / length[:, None, None], normal, friction, torsion / length[:, None], components
+    )
+    blocks = np.where(live[..., None, None], blocks, 0.0)
+    A = np.moveaxis(blocks, 1, 2).reshape(len(blocks), m, k * n)
+    by_component = {"f_x": friction, "f_y": friction, "f_n": np.ones_like(friction), "tau_n": torsion}
+    scale = np.stack([by_component[c] for c in components], -1)
+    return Rebuilt(valid, live, length, friction, torsion, blocks, A, scale, components, normal_index)
