@@ -6,6 +6,15 @@ Names follow the chapter "Wrench Resistant Grasps"; wrench resistance is what ot
 from .certificate import check_certificate
 from .contacts import ContactModel, Frictionless, HardFinger, SoftFinger
 from .criteria import Criterion, Gentlest, LeastNorm, Robust, SmallestSum, SumOfSquares
+from .equilibrium import (
+    Equilibrium,
+    EquilibriumKind,
+    ResistibleWrenches,
+    Squeeze,
+    equilibrium,
+    resistible_wrenches,
+    squeeze,
+)
 from .forces import ForceOptimum, optimize_forces
 from .grasp import (
     Grasp,
@@ -76,6 +85,13 @@ __all__ = [
     "SmallestSum",
     "SumOfSquares",
     "LeastNorm",
+    "equilibrium",
+    "Equilibrium",
+    "EquilibriumKind",
+    "squeeze",
+    "Squeeze",
+    "resistible_wrenches",
+    "ResistibleWrenches",
     # answers and their proofs
     "Status",
     "check_certificate",

@@ -221,7 +221,7 @@ def _number(value: Any, name: str, dtype) -> Array:
     return array.astype(dtype)
 
 
-def _loads(grasp: Grasp, wrench: Any) -> tuple[Array, tuple[int, ...]]:
+def spread_loads(grasp: Grasp, wrench: Any) -> tuple[Array, tuple[int, ...]]:
     """The wrench with all batch axes, and those axes: the grasp's, then any load axes."""
     m, batch = wrench_dimension(grasp.dimension), grasp.batch_shape
     array = _number(wrench, "wrench", grasp.dtype)
@@ -253,6 +253,13 @@ def _spread(
     return jnp.broadcast_to(full.reshape(*batch, *([1] * loads), *own), (*shape, *own))
 
 
+def _weight(value: Array, batch: tuple[int, ...], shape: tuple[int, ...]) -> Array:
+    """One per problem: from one for all, one per grasp, or one per load."""
+    if value.ndim == len(shape) > len(batch):
+        return jnp.broadcast_to(value, shape)
+    return _spread(value, (), batch, shape, "the criterion's weight")
+
+
 def _demand(
     grasp: Grasp,
     wrench: Array,
@@ -265,9 +272,7 @@ def _demand(
     n = grasp.model.force_size(grasp.dimension)
     contacts = contacts_of(grasp)
     spread = Contacts(*(_spread(x, x.shape[len(batch) :], batch, shape, "grasp") for x in contacts))
-    criterion = jax.tree.map(
-        lambda x: _spread(x.astype(dtype), (), batch, shape, "the criterion's weight"), criterion
-    )
+    criterion = jax.tree.map(lambda x: _weight(x.astype(dtype), batch, shape), criterion)
     log_det = None
     if criterion.barrier_weight is not None:
         terms = grasp.model.log_det_terms(grasp.dimension)
@@ -342,7 +347,7 @@ def optimize_forces(
     if not isinstance(smoothing, int | float) or not smoothing >= 0:
         raise ValueError(f"smoothing must be a number of at least 0, got {smoothing!r}")
     components = grasp.model.components(grasp.dimension)
-    loads, shape = _loads(grasp, wrench)
+    loads, shape = spread_loads(grasp, wrench)
     rows = _demand(grasp, loads, shape, criterion, max_normal, torque_limits)
     demand = rows[1]
     if smoothing:

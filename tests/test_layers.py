@@ -49,6 +49,7 @@ FLOORS = [
     "optimum",
     "sensitivity",
     "forces",
+    "equilibrium",
     "tracing",
     # the roof
     "errors",
