@@ -15,7 +15,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
-from jax.custom_batching import custom_vmap
 
 from ._types import Array, Float, Int, gap_floor, unit_roundoff
 from .balance import Demand, balance, proves, starting_point
@@ -23,7 +22,7 @@ from .contacts import Component
 from .criteria import Criterion, Gentlest
 from .geometry import wrench_dimension
 from .grasp import Grasp
-from .lanes import in_chunks, map_selected, map_tiles, padded_rows, tile_width, to_lanes, to_rows
+from .lanes import batched, in_chunks, map_selected, map_tiles, tile_width, to_lanes, to_rows
 from .margin import Contacts, fold, project
 from .optimum import Answer, answer
 from .resistance import contacts_of
@@ -164,34 +163,10 @@ def _solve_rows(plan: _Plan, rows: Rows, count: Array, tolerance: Array) -> Solv
     return Solved(answers, state.iterations, state.stop, state.point if plan.with_point else None)
 
 
-def _batched(plan: _Plan) -> Callable[[Rows, Array], Solved]:
-    """``_solve_rows`` with any number of leading batch axes, folded into rows; ``vmap`` only adds another axis."""
-
-    @custom_vmap
-    def run(rows: Rows, tolerance: Array) -> Solved:
-        batch = rows[0].active.shape[:-1]
-        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(batch) :]), rows)
-        n = flat[0].active.shape[0]
-        result = _solve_rows(plan, padded_rows(flat, plan.width), jnp.int32(n), tolerance)
-        return jax.tree.map(lambda x: x[:n].reshape(*batch, *x.shape[1:]), result)
-
-    @run.def_vmap
-    def rule(axis_size, in_batched, rows, tolerance):  # pyright: ignore[reportUnusedFunction]
-        batched, tolerance_batched = in_batched
-        if tolerance_batched:
-            raise ValueError("tolerance must be one number for the whole batch, not one per problem")
-        full = jax.tree.map(
-            lambda x, b: x if b else jnp.broadcast_to(x[None], (axis_size, *x.shape)), rows, batched
-        )
-        result = run(full, tolerance)
-        return result, jax.tree.map(lambda _: True, result)
-
-    return run
-
-
 @functools.cache
 def _compiled(plan: _Plan) -> Callable[..., Solved]:
-    return jax.jit(differentiable(_batched(plan), plan.components, plan.dimension))
+    solve = batched(functools.partial(_solve_rows, plan), lambda rows: rows[0].active.shape[:-1], plan.width)
+    return jax.jit(differentiable(solve, plan.components, plan.dimension))
 
 
 _solve_chunk = jax.jit(_solve_rows, static_argnames=("plan",))

@@ -7,6 +7,7 @@ numbers. Stragglers are gathered into fresh tiles instead of keeping a whole til
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -14,10 +15,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.custom_batching import custom_vmap
 
 from ._types import Array
 
-__all__ = ["in_chunks", "map_selected", "map_tiles", "padded_rows", "tile_width", "to_lanes", "to_rows"]
+__all__ = [
+    "batched",
+    "in_chunks",
+    "map_selected",
+    "map_tiles",
+    "padded_rows",
+    "tile_width",
+    "to_lanes",
+    "to_rows",
+]
 
 Rows = TypeVar("Rows")  # a pytree of arrays (N, ..)
 
@@ -53,7 +64,9 @@ def _count(rows: Any) -> int:
 def padded_rows(rows: Rows, width: int) -> Rows:
     """``rows`` with zero rows appended up to the next multiple of ``width``, at least one tile."""
     extra = max(1, -(-_count(rows) // width)) * width - _count(rows)
-    return jax.tree.map(lambda x: jnp.pad(x, [(0, extra)] + [(0, 0)] * (x.ndim - 1)), rows)
+    if not extra:
+        return rows
+    return jax.tree.map(lambda x: jnp.concatenate([x, jnp.zeros((extra, *x.shape[1:]), x.dtype)]), rows)
 
 
 def map_tiles(kernel: Callable[[Any], Any], rows: Any, count: Array, width: int) -> Any:
@@ -70,12 +83,19 @@ def map_tiles(kernel: Callable[[Any], Any], rows: Any, count: Array, width: int)
     out = jax.tree.map(lambda s: jnp.zeros((n, *s.shape[1:]), s.dtype), shapes)
 
     def one_tile(carry: tuple[Array, Any]) -> tuple[Array, Any]:
-        start, current = carry
+        tile, current = carry
+        start = tile * jnp.int32(width)
         result = kernel(tile_at(start))
         updated = jax.tree.map(lambda x, r: lax.dynamic_update_slice_in_dim(x, r, start, 0), current, result)
-        return start + jnp.int32(width), updated
+        return tile + jnp.int32(1), updated
 
-    return lax.while_loop(lambda carry: carry[0] < count, one_tile, (jnp.int32(0), out))[1]
+    tiles = _tiles(count, width)
+    return lax.while_loop(lambda carry: carry[0] < tiles, one_tile, (jnp.int32(0), out))[1]
+
+
+def _tiles(count: Array, width: int) -> Array:
+    """Tiles that hold ``count`` rows. Loops count tiles, not rows: XLA drops a loop from 0 to 1 in steps of ``width``."""
+    return (count + jnp.int32(width - 1)) // jnp.int32(width)
 
 
 def map_selected(kernel: Callable[[Any], Any], selected: Array, rows: Any, out: Rows, width: int) -> Rows:
@@ -88,16 +108,18 @@ def map_selected(kernel: Callable[[Any], Any], selected: Array, rows: Any, out: 
     index = jnp.nonzero(selected, size=n, fill_value=n)[0].astype(jnp.int32)
     count = jnp.sum(selected, dtype=jnp.int32)
 
+    tiles = _tiles(count, width)
+
     def pending(carry: tuple[Array, Rows]) -> Array:
-        return carry[0] < count
+        return carry[0] < tiles
 
     def one_tile(carry: tuple[Array, Rows]) -> tuple[Array, Rows]:
-        start, current = carry
-        chosen = lax.dynamic_slice(index, (start,), (width,))
+        tile_number, current = carry
+        chosen = lax.dynamic_slice(index, (tile_number * jnp.int32(width),), (width,))
         tile = jax.tree.map(lambda x: x.at[chosen].get(mode="clip"), rows)
         result = kernel(tile)
         updated = jax.tree.map(lambda x, r: x.at[chosen].set(r, mode="drop"), current, result)
-        return start + jnp.int32(width), updated
+        return tile_number + jnp.int32(1), updated
 
     return lax.while_loop(pending, one_tile, (jnp.int32(0), out))[1]
 
@@ -123,3 +145,30 @@ def in_chunks(solve: Callable[[Any, Array], Any], rows: Any, batch: tuple[int, .
         results.append(jax.tree.map(lambda x, c=count: np.asarray(x)[:c], result))
     joined = jax.tree.map(lambda *parts: np.concatenate(parts) if parts[1:] else parts[0], *results)
     return jax.tree.map(lambda x: jnp.asarray(x.reshape((*batch, *x.shape[1:]))), joined)
+
+
+def batched(
+    solve: Callable[[Any, Array, Array], Any], batch_of: Callable[[Any], tuple[int, ...]], width: int
+) -> Callable[[Any, Array], Any]:
+    """``solve(rows, count, tolerance)`` with any leading batch axes, folded into rows; ``vmap`` adds another."""
+
+    @custom_vmap
+    def run(rows: Any, tolerance: Array) -> Any:
+        batch = batch_of(rows)
+        n = math.prod(batch)
+        flat = jax.tree.map(lambda x: x.reshape(n, *x.shape[len(batch) :]), rows)
+        result = solve(padded_rows(flat, width), jnp.int32(n), tolerance)
+        return jax.tree.map(lambda x: x[:n].reshape(*batch, *x.shape[1:]), result)
+
+    @run.def_vmap
+    def rule(axis_size, in_batched, rows, tolerance):  # pyright: ignore[reportUnusedFunction]
+        spread, tolerance_batched = in_batched
+        if tolerance_batched:
+            raise ValueError("tolerance must be one number for the whole batch, not one per grasp")
+        full = jax.tree.map(
+            lambda x, b: x if b else jnp.broadcast_to(x[None], (axis_size, *x.shape)), rows, spread
+        )
+        result = run(full, tolerance)
+        return result, jax.tree.map(lambda _: True, result)
+
+    return run

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -172,12 +173,14 @@ def balance_many(run: LoadRun, progress: Callable[[ForceSummary], None] | None =
         _solve(run, _nothing(run))
         total.compile_seconds = time.perf_counter() - started
         started = time.perf_counter()
-        _write(run, _tables(run, kind, total, started, tell), kind)
+        # Closed before 64-bit arrays are switched off again: its threads still work on them.
+        with closing(_tables(run, kind, total, started, tell)) as tables:
+            _write(run, tables, kind)
         total.seconds = time.perf_counter() - started
     return total
 
 
-def _write(run: LoadRun, rows, kind: pa.Schema) -> None:
+def _write(run: LoadRun, rows: Iterable[pa.Table], kind: pa.Schema) -> None:
     assert run.output is not None
     try:
         write(run.output, rows, kind)
@@ -187,7 +190,7 @@ def _write(run: LoadRun, rows, kind: pa.Schema) -> None:
 
 def _tables(
     run: LoadRun, kind: pa.Schema, total: ForceSummary, started: float, tell: Callable[[ForceSummary], None]
-) -> Iterator[pa.Table]:
+) -> Generator[pa.Table]:
     """The chunks' tables in order, ``run.threads`` chunks worked on at a time; adds them to ``total``."""
     pending: deque[Future[tuple[pa.Table, ForceSummary]]] = deque()
 

@@ -235,7 +235,7 @@ def _unit(v: Vector) -> Vector:
 
 @stage
 def _statuses(
-    folded: Folded, program: ConvexProgram, valid: Array, off: Array, rest: Array, stop: Array, short: Array,
+    smoothing: Array | None, valid: Array, off: Array, rest: Array, stop: Array, short: Array,
     cost: Array, bound: Array, scale: Array, tolerance: Array, proof: Array, off_proof: Array, fine: float,
 ) -> Array:  # fmt: skip
     def choose(status: Status, where: Array, otherwise: Array) -> Array:
@@ -243,6 +243,8 @@ def _statuses(
 
     met = short <= fine
     tight = (cost - bound) <= tolerance * jnp.maximum(scale, jnp.abs(cost))
+    if smoothing is not None:  # the answer is a point of the central path, at a gap of its own
+        tight = stop == Stop.CONVERGED.value
     finite = jnp.isfinite(cost) & jnp.isfinite(bound)
     status = jnp.full(cost.shape, Status.STALLED.value, jnp.int32)
     status = choose(Status.INFEASIBLE, proof > 0, status)
@@ -277,7 +279,6 @@ def answer(
     tolerance: Array,
     components: tuple[Component, ...],
     dimension: int,
-    smooth: bool = False,
 ) -> Answer:
     """Read one tile's answers off its points. Nothing is claimed that was not proven."""
     program, load = problem.program, problem.load
@@ -304,7 +305,7 @@ def answer(
     off_proof = _off_proof(folded, load.twist, load.wrench, load.size, PROVEN_LIMIT)
     fine = rounding_constant() * unit_roundoff(dtype)
     status = _statuses(
-        folded, program, problem.valid, load.off, load.rest & (weight is None), stop, short, cost, bound, scale,
+        program.smoothing, problem.valid, load.off, load.rest & (weight is None), stop, short, cost, bound, scale,
         tolerance, proof, off_proof, fine,
     )  # fmt: skip
 

@@ -17,14 +17,13 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.core import Tracer
-from jax.custom_batching import custom_vmap
 
 from ._types import Array, Float, Int, gap_floor, rank_tolerance, rounding_constant, unit_roundoff
 from .cones import cone_max, cone_sum
 from .contacts import Component
 from .geometry import wrench_dimension
 from .grasp import Grasp
-from .lanes import in_chunks, map_selected, map_tiles, padded_rows, tile_width, to_lanes, to_rows
+from .lanes import batched, in_chunks, map_selected, map_tiles, tile_width, to_lanes, to_rows
 from .margin import (
     Contacts,
     Folded,
@@ -33,6 +32,7 @@ from .margin import (
     project,
     starting_point,
 )
+from .margin_sensitivity import Solved, differentiable
 from .singular import row_svd
 from .solver import ConeProgram, Iterate, Progress, Stop
 from .solver.interior_point import begin, solve
@@ -204,7 +204,7 @@ def _answer_kernel(plan: _Plan) -> Callable[..., Verdict]:
     return run
 
 
-def _solve_rows(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array) -> WrenchResistance:
+def _solve_rows(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array) -> Solved:
     """All sweeps over the first ``count`` of (N, ..) rows; N is a multiple of the tile width."""
     m = wrench_dimension(plan.dimension)
     n, dtype, width = contacts.position.shape[0], contacts.position.dtype, plan.width
@@ -236,41 +236,25 @@ def _solve_rows(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array)
     answer = _answer_kernel(plan)
     rows = (contacts, state, setup.unbounded, ranks)
     verdict = map_tiles(lambda tile: answer(*tile, tolerance), rows, count, width)
-    return WrenchResistance(*verdict, iterations=state.iterations, stop=state.stop)
-
-
-@functools.cache
-def _batched(plan: _Plan) -> Callable[..., WrenchResistance]:
-    """The solver with any number of leading batch axes, folded into rows; ``vmap`` only adds another axis."""
-
-    @custom_vmap
-    def run(contacts: Contacts, tolerance: Array) -> WrenchResistance:
-        batch = contacts.active.shape[:-1]
-        rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(batch) :]), contacts)
-        n = rows.active.shape[0]
-        result = _solve_rows(plan, padded_rows(rows, plan.width), jnp.int32(n), tolerance)
-        return jax.tree.map(lambda x: x[:n].reshape(*batch, *x.shape[1:]), result)
-
-    @run.def_vmap
-    def rule(axis_size, in_batched, contacts, tolerance):  # pyright: ignore[reportUnusedFunction]
-        batched, tolerance_batched = in_batched
-        if tolerance_batched:
-            raise ValueError("tolerance must be one number for the whole batch, not one per grasp")
-        full = jax.tree.map(
-            lambda x, b: x if b else jnp.broadcast_to(x[None], (axis_size, *x.shape)), contacts, batched
-        )
-        result = run(full, tolerance)
-        return result, jax.tree.map(lambda _: True, result)
-
-    return run
+    return Solved(verdict, state.iterations, state.stop, (state.y, state.u, state.z))
 
 
 @functools.cache
 def _compiled(plan: _Plan) -> Callable[..., WrenchResistance]:
-    return jax.jit(_batched(plan))
+    solve = batched(functools.partial(_solve_rows, plan), lambda rows: rows.active.shape[:-1], plan.width)
+    run = differentiable(solve, plan.components, plan.dimension, exact=not plan.verdict_only)
+
+    def result(contacts: Contacts, tolerance: Array) -> WrenchResistance:
+        solved = run(contacts, tolerance)
+        return WrenchResistance(*solved.verdict, iterations=solved.iterations, stop=solved.stop)
+
+    return jax.jit(result)
 
 
-_solve_chunk = jax.jit(_solve_rows, static_argnames=("plan",))
+@functools.partial(jax.jit, static_argnames=("plan",))
+def _solve_chunk(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array) -> WrenchResistance:
+    solved = _solve_rows(plan, contacts, count, tolerance)
+    return WrenchResistance(*solved.verdict, iterations=solved.iterations, stop=solved.stop)
 
 
 def _solve_on_host(plan: _Plan, contacts: Contacts, tolerance: Array) -> WrenchResistance:

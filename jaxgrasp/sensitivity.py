@@ -32,6 +32,7 @@ from .solver.implicit import lagrangian, point_tangent, residuals
 from .solver.linear import Cholesky, Vector, solve_lower, solve_transposed
 from .solver.stages import inlined
 from .status import Status
+from .tangents import in_row_basis, kept, masked, safe_contacts, zero_tangent
 from .verdict import unfold
 
 __all__ = ["Solved", "differentiable"]
@@ -70,10 +71,8 @@ def _program(rows: Rows, scales: Scales, components: tuple[Component, ...], dime
     """The scaled program as a differentiable function of the data."""
     contacts, demand = rows
     folded = fold(contacts, components, scales.length)
-    m = folded.columns[0].shape[0]
-    columns = tuple(
-        jnp.stack(solve_lower(scales.factor, tuple(c[i] for i in range(m)))[0]) for c in folded.columns
-    )
+    columns = in_row_basis(scales.factor, folded.columns)
+    m = columns[0].shape[0]
     wrench = to_lanes(demand.wrench)
     outer = tuple(wrench[i] if i < dimension else wrench[i] / scales.length for i in range(m))
     inner, _ = solve_lower(scales.factor, outer)
@@ -84,38 +83,23 @@ def _program(rows: Rows, scales: Scales, components: tuple[Component, ...], dime
     return program
 
 
-def _safe(ok: Array, rows: Rows, dimension: int) -> Rows:
-    """``rows`` with harmless numbers in the lanes without a derivative, so that no NaN enters, forwards or backwards."""
+def _safe(ok: Array, rows: Rows) -> Rows:
+    """``rows`` with harmless numbers in the lanes without a derivative."""
     contacts, demand = rows
 
-    def keep(x: Array, value: Any) -> Array:
-        mask = ok.reshape(*ok.shape, *([1] * (x.ndim - 1)))
-        return jnp.where(mask, x, jnp.asarray(value, x.dtype))
+    def keep(x: Array | None, value: float) -> Array | None:
+        return None if x is None else kept(ok, x, value)
 
-    axis = np.eye(dimension)[-1]
-    plain = Contacts(
-        keep(contacts.position, axis), keep(contacts.normal, axis), keep(contacts.friction, 1.0),
-        keep(contacts.torsion, 1.0), keep(contacts.active, True),
-    )  # fmt: skip
     asked = Demand(
-        keep(demand.wrench, 0.0),
-        jax.tree.map(lambda x: keep(x, 1.0), demand.criterion),
-        jax.tree.map(lambda x: keep(x, 1.0), demand.log_det),
-        None if demand.cap is None else keep(demand.cap, np.inf),
-        None if demand.jacobian is None else keep(demand.jacobian, 0.0),
-        None if demand.torque is None else keep(demand.torque, 1.0),
-        None if demand.smoothing is None else keep(demand.smoothing, 1.0),
+        kept(ok, demand.wrench, 0.0),
+        jax.tree.map(lambda x: kept(ok, x, 1.0), demand.criterion),
+        jax.tree.map(lambda x: kept(ok, x, 1.0), demand.log_det),
+        keep(demand.cap, np.inf),
+        keep(demand.jacobian, 0.0),
+        keep(demand.torque, 1.0),
+        keep(demand.smoothing, 1.0),
     )
-    # Padded contacts may hold anything.
-    live = plain.active
-    point = live[..., None]
-    plain = plain._replace(
-        position=jnp.where(point, plain.position, jnp.asarray(axis, plain.position.dtype)),
-        normal=jnp.where(point, plain.normal, jnp.asarray(axis, plain.normal.dtype)),
-        friction=jnp.where(live, plain.friction, jnp.ones_like(plain.friction)),
-        torsion=jnp.where(live, plain.torsion, jnp.ones_like(plain.torsion)),
-    )
-    return plain, asked
+    return safe_contacts(ok, contacts), asked
 
 
 def _safe_point(ok: Array, point: Point) -> Point:
@@ -180,12 +164,6 @@ def _value(
     return total
 
 
-def _zero_tangent(x: Array) -> Any:
-    if jnp.issubdtype(x.dtype, jnp.floating):
-        return jnp.zeros_like(x)
-    return np.zeros(x.shape, jax.dtypes.float0)
-
-
 def differentiable(
     solve: Callable[[Rows, Array], Solved], components: tuple[Component, ...], dimension: int
 ) -> Callable[[Rows, Array], Solved]:
@@ -211,7 +189,7 @@ def _tangents(
 ) -> Solved:
     batch = result.answer.status.shape
     count = math.prod(batch)
-    zero = jax.tree.map(_zero_tangent, result)
+    zero = jax.tree.map(zero_tangent, result)
 
     def flat(x: Any) -> Any:
         return x.reshape(count, *x.shape[len(batch) :])
@@ -223,8 +201,8 @@ def _tangents(
     stop, point = flat(result.stop), jax.tree.map(lambda x: to_lanes(flat(x)), result.point)
     ok = (answer.status == Status.OPTIMAL.value) & (stop != Stop.SKIPPED.value)
 
-    data = _safe(ok, data, dimension)
-    changes = jax.tree.map(lambda x, dx: _masked(ok, x, dx), data, changes)
+    data = _safe(ok, data)
+    changes = jax.tree.map(lambda x, dx: masked(ok, x, dx), data, changes)
     point = _safe_point(ok, point)
     scales = _scales(data, components, dimension)
 
@@ -255,10 +233,3 @@ def _tangents(
     )
     point_change = jax.tree.map(back, moved)
     return zero._replace(answer=answer_change, point=point_change)
-
-
-def _masked(ok: Array, x: Array, dx: Any) -> Any:
-    if not jnp.issubdtype(x.dtype, jnp.floating):
-        return dx
-    mask = ok.reshape(*ok.shape, *([1] * (x.ndim - 1)))
-    return jnp.where(mask, dx, jnp.zeros_like(dx))

@@ -44,6 +44,8 @@ FLOORS = [
     "singular",
     "margin",
     "verdict",
+    "tangents",
+    "margin_sensitivity",
     "resistance",
     "balance",
     "optimum",

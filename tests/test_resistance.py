@@ -347,3 +347,13 @@ def test_members_are_found_by_entries_of_arrays_and_by_nothing_else(enum):
     for wrong in (17, 1.5, "RESISTANT", None):
         with pytest.raises(ValueError, match="not a valid"):
             enum(wrong)
+
+
+def test_one_grasp_under_jit():
+    """XLA once dropped the loop over tiles when the batch was a single grasp known at compile time."""
+    rng = np.random.default_rng(4)
+    normal = rng.normal(size=(1, 4, 3))
+    grasp = jg.Grasp(-normal / np.linalg.norm(normal, axis=-1, keepdims=True), normal, jg.HardFinger(0.5))
+    eager, jitted = jg.wrench_resistance(grasp), jax.jit(jg.wrench_resistance)(grasp)
+    assert int(jitted.status[0]) == int(eager.status[0]) != 0
+    np.testing.assert_allclose(jitted.margin, eager.margin, atol=1e-8)

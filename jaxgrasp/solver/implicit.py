@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from .._types import Array, widest_scaling
+from .._types import Array, unit_roundoff, widest_scaling
 from ..cones import Cone, cone_sum, inner
 from .blocks import Frame, tail_basis, unit_direction
 from .convex import Bounds, ConvexProgram, Point
@@ -94,8 +94,8 @@ def _products(program: ConvexProgram, point: Point) -> Array:
     """<u_i, z_i>: fixed but for the floors in it."""
     product, floor = inner(point.u, point.z), program.cone_target()
     base = lax.stop_gradient(product) if floor is None else floor + lax.stop_gradient(product - floor)
-    tiny = jnp.finfo(product.dtype).tiny
-    return jnp.where(program.exists > 0, jnp.maximum(base, tiny), jnp.ones_like(base))
+    least = unit_roundoff(product.dtype) * lax.stop_gradient(point.u[0] * point.z[0])
+    return jnp.where(program.exists > 0, jnp.maximum(base, least), jnp.ones_like(base))
 
 
 def central_frame(program: ConvexProgram, point: Point) -> Frame:
@@ -133,7 +133,9 @@ def _system(program: ConvexProgram, point: Point) -> _System:
     rates = _families(lambda m, s, p: m * p / s, masks, point.slack, point.price)
     eigenvalues = [w for w in (frame.along, frame.against, frame.across) if w is not None]
     stiffness = [1 / (w * w) for w in eigenvalues]
-    stiffness = (*stiffness[:2], *(stiffness[2:] * (len(point.u) - 2))) if len(point.u) > 1 else (stiffness[0],)
+    stiffness = (
+        (*stiffness[:2], *(stiffness[2:] * (len(point.u) - 2))) if len(point.u) > 1 else (stiffness[0],)
+    )
     limit = jnp.asarray(widest_scaling(program.exists.dtype) ** 0.5, program.exists.dtype)
     cut = [None if w is None else jnp.minimum(w, limit) for w in (frame.along, frame.against, frame.across)]
     assert cut[0] is not None

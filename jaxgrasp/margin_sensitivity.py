@@ -1,0 +1,140 @@
+"""Derivatives of the margin of wrench resistance with respect to positions, normals and coefficients.
+
+    d t* = derivative of the Lagrangian of the margin's cone program, the solution fixed    (envelope theorem)
+
+and of the internal force behind it, by the implicit function theorem. t* depends on Null(A) alone, so L and the factor
+of A, which scale the program, are held fixed. A ``custom_jvp`` whose rule calls the same function: it nests. Lanes
+without a margin (INVALID, t* = -inf), and all lanes of ``verdict_only``, have derivative 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from ._types import Array
+from .cones import Cone, cone_sum
+from .contacts import Component
+from .lanes import to_lanes, to_rows
+from .margin import Contacts, fold, margin_program, project
+from .solver import Stop
+from .solver.convex import Bounds, ConvexProgram, Point
+from .solver.implicit import lagrangian, point_tangent, residuals
+from .solver.linear import Cholesky
+from .solver.stages import inlined
+from .tangents import in_row_basis, kept, masked, safe_contacts, zero_tangent
+from .verdict import Verdict, unfold
+
+__all__ = ["Solved", "differentiable"]
+
+NO_BOUNDS = Bounds(None, None, None, None, None)
+
+
+class Solved(NamedTuple):
+    """The solver's part of a result, as rows; ``point`` is (y, u, z) of the margin's cone program."""
+
+    verdict: Verdict
+    iterations: Array
+    stop: Array
+    point: tuple[Array, Array, Array]
+
+
+class Scales(NamedTuple):
+    """Constants of the derivative, lanes last."""
+
+    length: Array
+    factor: Cholesky
+
+
+def _scales(contacts: Contacts, components: tuple[Component, ...]) -> Scales:
+    folded = fold(lax.stop_gradient(contacts), components)
+    return lax.stop_gradient(Scales(folded.length, project(folded).factor))
+
+
+def _program(contacts: Contacts, scales: Scales, components: tuple[Component, ...]) -> ConvexProgram:
+    """``margin.margin_program`` as a differentiable function of the contacts."""
+    folded = fold(contacts, components, scales.length)
+    columns = in_row_basis(scales.factor, folded.columns)
+    m = columns[0].shape[0]
+    resultant = tuple(cone_sum(columns[0][i]) for i in range(m))
+    program = margin_program(folded._replace(columns=columns, resultant=resultant))
+    none = (None,) * 7
+    return ConvexProgram(program.columns, jnp.stack(program.rhs), program.exists, program.cost[0], *none)
+
+
+def _internal_force(
+    contacts: Contacts, exists: Array, u: Cone, t: Array, components: tuple[Component, ...]
+) -> Array:
+    """``s = u + t e`` in the caller's components."""
+    s = (exists * (u[0] + t), *(exists * x for x in u[1:]))
+    return unfold(s, components, to_lanes(contacts.friction), to_lanes(contacts.torsion))
+
+
+def differentiable(
+    solve: Callable[[Contacts, Array], Solved],
+    components: tuple[Component, ...],
+    dimension: int,
+    exact: bool,
+) -> Callable[[Contacts, Array], Solved]:
+    """``solve`` with derivatives of margin and internal force; ``exact``: the solver went to the optimum."""
+
+    @jax.custom_jvp
+    def run(contacts: Contacts, tolerance: Array) -> Solved:
+        return solve(contacts, tolerance)
+
+    @run.defjvp
+    def rule(primals, tangents):  # pyright: ignore[reportUnusedFunction]
+        contacts, tolerance = primals
+        result = run(contacts, tolerance)
+        if not exact:
+            return result, jax.tree.map(zero_tangent, result)
+        with inlined():
+            change = _tangents(result, contacts, tangents[0], components)
+        return result, change
+
+    return run
+
+
+def _tangents(result: Solved, contacts: Contacts, change: Any, components: tuple[Component, ...]) -> Solved:
+    batch = result.stop.shape
+    count = math.prod(batch)
+
+    def flat(x: Any) -> Any:
+        return x.reshape(count, *x.shape[len(batch) :])
+
+    data, changes = jax.tree.map(flat, contacts), jax.tree.map(flat, change)
+    ok = jnp.isfinite(flat(result.verdict.margin)) & (flat(result.stop) != Stop.SKIPPED.value)
+    data, changes = safe_contacts(ok, data), jax.tree.map(lambda x, dx: masked(ok, x, dx), data, changes)
+    y, u, z = (flat(x) for x in result.point)  # (N, m), (N, d, k), (N, d, k)
+    apex = jnp.zeros(u.shape[1:2], u.dtype).at[0].set(1.0)[:, None]
+
+    def cone(rows: Array) -> Cone:
+        lanes = to_lanes(kept(ok, rows, apex))
+        return tuple(lanes[i] for i in range(lanes.shape[0]))
+
+    point = Point(-to_lanes(kept(ok, y, 0.0)), None, cone(u), cone(z), NO_BOUNDS, NO_BOUNDS)
+    scales = _scales(data, components)
+    program = _program(data, scales, components)
+    _, residual = jax.jvp(lambda c: residuals(_program(c, scales, components), point), (data,), (changes,))
+    moved = point_tangent(program, point, residual)
+    _, cost = jax.jvp(lambda c: lagrangian(_program(c, scales, components), point), (data,), (changes,))
+    t = 1 - cone_sum(program.price * point.u[0])
+    _, force = jax.jvp(
+        lambda c, u, t: _internal_force(c, program.exists, u, t, components),
+        (data, point.u, t),
+        (changes, moved.u, -cost),
+    )
+
+    def back(x: Array) -> Array:
+        x = jnp.where(ok, x, jnp.zeros_like(x))
+        return to_rows(x).reshape(*batch, *x.shape[:-1])
+
+    zero = jax.tree.map(zero_tangent, result)
+    verdict = zero.verdict._replace(margin=back(-cost), internal_force=back(force))
+    moves = (back(-moved.y), back(jnp.stack(moved.u)), back(jnp.stack(moved.z)))
+    return zero._replace(verdict=verdict, point=moves)
