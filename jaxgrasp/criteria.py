@@ -77,8 +77,8 @@ class Robust(Criterion):
     """``max_i f_n,i - weight * sum_i log det P_i(f_i)``: gentle, but away from the edge of friction (11.3, robust).
 
     ``weight`` in N (default 1). P_i is (11.4) for hard fingers, ``[[mu f_n, f_t], [f_t, mu f_n]]`` in the plane,
-    (11.35) for soft fingers, the scalar f_n for frictionless contacts and wherever mu = 0; forces in N under the logarithm.
-    The cost is in N up to the constant that a change of the unit under the logarithm adds.
+    (11.35) for soft fingers, the scalar f_n for frictionless contacts and wherever mu = 0; forces in N under the
+    logarithm. The cost is in N up to the constant that a change of the unit under the logarithm adds.
     """
 
     weight: Array

@@ -1,4 +1,4 @@
-"""Definition 2 and Figure 11.1: can a grasp balance a load at all, with forces to spare, and how hard must it squeeze?"""
+"""Definition 2 and Figure 11.1: can a grasp balance a load, with forces to spare, and how hard must it squeeze?"""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ def map_tiles(kernel: Callable[[Any], Any], rows: Any, count: Array, width: int)
 
 
 def _tiles(count: Array, width: int) -> Array:
-    """Tiles that hold ``count`` rows. Loops count tiles, not rows: XLA drops a loop from 0 to 1 in steps of ``width``."""
+    """Tiles that hold ``count`` rows. Loops count tiles: XLA drops a loop from 0 to 1 in steps of ``width``."""
     return (count + jnp.int32(width - 1)) // jnp.int32(width)
 
 

@@ -138,7 +138,7 @@ def _covered(short: Array, cap: Array | None, total: Array) -> Array:
 
 @stage
 def _linear_bound(program: ConvexProgram, pull: Pull) -> Array:
-    """Dual value of prices and levels: the better of the twist as it is, paying caps, and the twist scaled to need none."""
+    """Dual value of prices and levels: the twist as it is, paying caps, or scaled to need none."""
     exists, x = program.exists, pull.x
     zero = jnp.zeros_like(exists)
     short = exists * jnp.maximum(tail_norm(x) - x[0], zero)

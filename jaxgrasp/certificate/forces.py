@@ -1,6 +1,6 @@
 """Optimal forces and infeasible loads proved again (theory section 3).
 
-With the folded map A (lengths over L), the forces s (f = mu s, gamma s, s), the load w, and x_i = A_i^T y + J_i beta for
+With the folded map A (lengths over L), the forces s (f = mu s, gamma s, s), the load w and x_i = A_i^T y + J_i beta for
 the twist y and the joint rates beta of the result:
 
     OPTIMAL     A s + w is rounding, s_0,i >= |s_t,i|, s_0,i <= cap_i, |J^T f| <= tau_max, all to rounding; the cost

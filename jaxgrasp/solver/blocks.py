@@ -4,7 +4,7 @@ Near the solution W has eigenvalues from 0 to infinity, and any sum of ``W^-2`` 
 In the Jordan frame of W it is diagonal: along (1, d), (1, -d), and across, with eigenvalues ``along``, ``against``,
 ``across``. There K is I plus a small matrix of products, and its determinant a sum of positive terms.
 
-Frame coordinates of a cone vector x: ``((x_0 + d.x_t) / sqrt 2, (x_0 - d.x_t) / sqrt 2, rest)``, ``rest`` orthogonal to d.
+Frame coordinates of a cone vector x: ``((x_0 + d.x_t) / sqrt 2, (x_0 - d.x_t) / sqrt 2, rest)``, ``rest`` across d.
 """
 
 from __future__ import annotations

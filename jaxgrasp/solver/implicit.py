@@ -2,7 +2,7 @@
 
 A point on the central path solves, with its own products held fixed,
 
-    z = gradient(u, y, prices),  B u = b,  slack = limit - value,  u_i o z_i = (phi_i + mu_i) e,  slack price = floor + mu.
+    z = gradient(u, y, prices),  B u = b,  slack = limit - value,  u_i o z_i = (phi_i + mu_i) e,  slack price = floor.
 
 A change of the data leaves residuals in these equations; one solve with the Newton matrix removes them. At the end of
 the iteration mu is rounding-small and the derivative is that of the solution where strict complementarity holds, and

@@ -1,0 +1,156 @@
+"""Optimal forces against Clarabel: 3 000 problems a criterion, with and without limits, feasible or not."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from families import random_active, random_coefficients, random_contacts
+from force_oracle import clarabel_forces, folded_map
+
+import jaxgrasp as jg
+from jaxgrasp import Status
+
+K, JOINTS = 5, 3
+MODELS = {
+    "soft": (lambda mu, gamma: jg.SoftFinger(mu, gamma), 3),
+    "hard": (lambda mu, gamma: jg.HardFinger(mu), 3),
+    "planar hard": (lambda mu, gamma: jg.HardFinger(mu), 2),
+    "frictionless": (lambda mu, gamma: jg.Frictionless(np.zeros_like(mu)), 3),
+}
+CRITERIA = {
+    "gentlest": (lambda x: jg.Gentlest(), None),
+    "robust": (jg.Robust, 0.7),
+    "smallest sum": (lambda x: jg.SmallestSum(), None),
+    "sum of squares": (lambda x: jg.SumOfSquares(), None),
+    "least norm": (lambda x: jg.LeastNorm(x), 0.2),
+}
+# (model, limits, problems); each row compiles once.
+RUNS = {
+    "gentlest": [
+        ("soft", False, 1200),
+        ("soft", True, 1000),
+        ("planar hard", True, 500),
+        ("frictionless", False, 300),
+    ],
+    "robust": [("soft", True, 1800), ("hard", False, 1200)],
+    "smallest sum": [("soft", True, 1500), ("hard", False, 1500)],
+    "sum of squares": [("soft", True, 1800), ("planar hard", False, 1200)],
+    "least norm": [("soft", True, 2000), ("hard", False, 1000)],
+}
+
+
+def problems(name, limits, count, seed):
+    """Random grasps of all kinds and loads of four: any, balanced inside, balanced on the edge, just beyond it."""
+    model, dimension = MODELS[name]
+    rng = np.random.default_rng(seed)
+    position, normal, _ = random_contacts(rng, count, K, dimension)
+    friction, torsion = random_coefficients(rng, count, K)
+    active = random_active(rng, count, K)
+    probe = jg.Grasp(position, normal, model(friction, torsion), active)
+    components = [c.value for c in probe.model.components(dimension)]
+    n, m = len(components), 3 if dimension == 2 else 6
+    wrench = rng.normal(size=(count, m))
+    kind = rng.integers(4, size=count)
+    G = np.asarray(jg.folded_grasp_map(probe)).reshape(count, m, K, n)
+    head = components.index("f_n")
+    s = rng.normal(size=(count, K, n))
+    tails = np.delete(s, head, -1)
+    share = rng.uniform(0, 0.9, (count, K)) ** 0.5
+    share[kind == 2] = 1.0
+    share[kind == 3] = 1.0 + 10.0 ** rng.uniform(-5, -2, (kind == 3).sum())[:, None]
+    norm = np.maximum(np.linalg.norm(tails, axis=-1), 1e-12) if n > 1 else np.ones((count, K))
+    press = rng.uniform(0.2, 1.0, (count, K))
+    s = s * (share * press / norm)[..., None]
+    s[..., head] = press
+    made = -np.einsum("lmkn,lkn->lm", G, np.where(active[..., None], s, 0.0))
+    wrench[kind > 0] = made[kind > 0]
+    wrench *= 10.0 ** rng.uniform(-1, 2, (count, 1))
+    cap = limit = None
+    if limits:
+        size = np.linalg.norm(wrench, axis=-1)[:, None]
+        cap = np.where(rng.random((count, K)) < 0.5, size * 10.0 ** rng.uniform(-0.5, 1, (count, K)), np.inf)
+        jacobian = rng.normal(size=(count, K * n, JOINTS)) * (rng.random((count, 1, JOINTS)) < 0.7)
+        limit = (jacobian, size * 10.0 ** rng.uniform(-0.3, 1.5, (count, JOINTS)))
+    return probe, components, wrench, cap, limit
+
+
+def oracle(grasp, components, wrench, criterion, parameter, cap, limit):
+    model = grasp.model
+    arrays = [
+        np.asarray(x)
+        for x in (
+            grasp.position,
+            grasp.normal,
+            model.friction_coefficient,
+            model.torsion_coefficient,
+            grasp.active,
+        )
+    ]
+    answers = []
+    for i in range(len(wrench)):
+        one = [a[i] for a in arrays]
+        limits = None if limit is None else (limit[0][i], limit[1][i])
+        answers.append(
+            clarabel_forces(
+                *one, components, wrench[i], criterion, parameter, None if cap is None else cap[i], limits
+            )
+        )
+    return np.array([a for a, _, _ in answers]), np.array([c for _, c, _ in answers])
+
+
+@pytest.mark.parametrize("criterion", CRITERIA)
+def test_clarabel_agrees(criterion):
+    make, parameter = CRITERIA[criterion]
+    for run, (name, limits, count) in enumerate(RUNS[criterion]):
+        grasp, components, wrench, cap, limit = problems(name, limits, count, seed=30 + run)
+        out = jg.optimize_forces(grasp, wrench, make(parameter), cap, limit)
+        status, cost = np.asarray(out.status), np.asarray(out.cost)
+        answer, best = oracle(grasp, components, wrench, criterion, parameter, cap, limit)
+        optimal, infeasible = status == Status.OPTIMAL, status == Status.INFEASIBLE
+        stalled = status == Status.STALLED
+        both = optimal & (answer == "optimal")
+        top = np.max(np.abs(np.asarray(out.force)), -1)
+        scale = np.abs(best)
+            if criterion == "robust":
+                scale = scale + parameter + top
+        error = np.abs(cost[both] - best[both]) / np.maximum(scale[both], 1e-300)
+        contradictions = (optimal & (answer == "infeasible")) | (infeasible & (answer == "optimal"))
+        print(
+            f"\n{criterion}, {name}, limits {limits}: {count} problems, {both.sum()} compared, largest relative "
+            f"difference {error.max():.1e}; {(infeasible & (answer == 'infeasible')).sum()} infeasible for both, "
+            f"{(answer == 'unknown').sum()} unknown to Clarabel, {stalled.sum()} stalled "
+            f"({(stalled & (answer != 'unknown')).sum()} of them known to it), {contradictions.sum()} contradictions"
+        )
+        accepted = jg.check_certificate(grasp, out)
+        assert np.flatnonzero(~accepted).size == 0
+        assert set(np.unique(status)) <= {Status.OPTIMAL, Status.INFEASIBLE, Status.STALLED}
+        assert contradictions.sum() == 0
+        assert both.sum() > 0.2 * count
+        assert infeasible.sum() > 0.05 * count
+        assert (error < 1e-7).all(), np.sort(error)[-5:]
+        assert (stalled & (answer != "unknown")).mean() < 0.01
+
+
+def test_there_are_enough_problems():
+    assert all(sum(count for *_, count in runs) >= 3000 for runs in RUNS.values())
+
+
+def test_the_oracle_knows_the_pinch():
+    """Two opposing hard fingers lift W: W / (2 mu) each; twice that in sum; the edge of friction for both."""
+    position = np.array([[-1.0, 0, 0], [1.0, 0, 0]])
+    names, active = ["f_x", "f_y", "f_n"], np.ones(2, bool)
+    load = np.array([0, 0, -3.0, 0, 0, 0])
+    for criterion, expected in (
+        ("gentlest", 3.0),
+        ("smallest sum", 6.0),
+        ("sum of squares", 18.0),
+        ("least norm", 22.5),
+    ):
+        answer, cost, force = clarabel_forces(position, -position, 0.5, 0.0, active, names, load, criterion)
+        assert answer == "optimal"
+        assert cost == pytest.approx(expected, rel=1e-8)
+        assert force[[2, 5]] == pytest.approx([3.0, 3.0], rel=1e-6)
+    blocks, _ = folded_map(position, -position, np.full(2, 0.5), np.zeros(2), names)
+    assert np.linalg.matrix_rank(np.moveaxis(blocks, 0, 1).reshape(6, -1)) == 5
+    answer, *_ = clarabel_forces(position, -position, 0.5, 0.0, active, names, np.eye(6)[3], "gentlest")
+    assert answer == "infeasible"
+    assert jnp.isfinite(cost)
