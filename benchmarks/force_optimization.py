@@ -7,7 +7,8 @@ One process pinned to one core, single-threaded. Hard fingers on a sphere with t
 are random for k > 2 (a third of them cannot be balanced) and balanced by construction for k = 2. Everyone works to
 1e-8. Moreau gets the primal and, where it exists, the smaller dual form, matrices built beforehand, and the faster
 counts; ours starts from positions and normals and ends with bounds and twists. ``gradient`` is the derivative of the
-sum of the costs, ``force gradient`` that of a random combination of all optimal forces, with respect to positions, normals, mu and
+sum of the costs, ``force gradient``
+that of a random combination of all optimal forces, with respect to positions, normals, mu and
 loads; for Moreau it is ``backward`` with respect to its matrices and vectors. Times are medians over repeats that take
 turns; compile and construction times stand apart. No test asserts a time.
 """
@@ -24,14 +25,14 @@ from wrench_resistance import hardware, random_grasps  # also pins the process a
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
-import importlib  # noqa: E402
-from typing import Any  # noqa: E402
+import importlib
+from typing import Any
 
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
+import jax
+import jax.numpy as jnp
+import numpy as np
 
-import jaxgrasp as jg  # noqa: E402
+import jaxgrasp as jg
 
 TOLERANCE = 1e-8
 CRITERIA = {

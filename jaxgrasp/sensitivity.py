@@ -4,7 +4,8 @@
     d force = one solve with the Newton matrix at the solution                   (implicit function theorem)
 
 A ``custom_jvp`` whose rule calls the same function again, so gradients, Hessians and every nesting are exact. The
-load's size, the length L and the factor of A only scale the problem; the rule holds them fixed. Lanes without an optimum, and
+load's size, the length L and the factor of A only scale the problem; the rule holds them
+fixed. Lanes without an optimum, and
 lanes without a load, have derivative 0.
 """
 

@@ -8,7 +8,7 @@ import pytest
 import jaxgrasp as jg
 from jaxgrasp import Status
 
-STEP = 1e-5
+STEP = 1e-4
 
 
 def planar_problem(seed=0, grasps=12):
@@ -95,7 +95,11 @@ def weights_of(values, seed=5):
     return {name: jnp.asarray(rng.normal(size=np.shape(v))) for name, v in values.items()}
 
 
-@pytest.fixture(scope="module", params=CASES)
+FAST = ("margin, planar", "smoothed gentlest with limits")
+MARKED = [pytest.param(n, marks=() if n in FAST else pytest.mark.slow) for n in CASES]
+
+
+@pytest.fixture(scope="module", params=MARKED)
 def case(request):
     """Values, jvp and vjp from one compiled program, and its central differences of fourth order."""
     function, problem = CASES[request.param]
@@ -144,7 +148,7 @@ def test_jvp_against_differences(case):
             np.testing.assert_array_equal(slope["bound"], slope["value"])
             continue
         error = relative(slope[quantity], differences[quantity], fine)
-        # Differences of numbers known to 1e-11 over 1e-5; kinks are counted, not averaged away.
+        # Differences of numbers known to 1e-11 over 1e-4; kinks are counted, not averaged away.
         assert np.median(error) < 1e-6, (name, quantity, error)
         assert np.mean(error > 1e-4) <= 0.2, (name, quantity, error)
 
@@ -152,10 +156,13 @@ def test_jvp_against_differences(case):
 def test_vjp_is_the_transpose(case):
     _, gradient, _, _, _, forward, backward = case
     assert all(np.isfinite(np.asarray(g)).all() for g in gradient.values())
-    assert backward == pytest.approx(forward, rel=1e-8, abs=1e-8)
+    # Two orders of the same sums, through a Newton matrix of condition up to 1e7 squared, refined twice.
+    assert backward == pytest.approx(forward, rel=1e-6, abs=1e-8)
 
 
-@pytest.mark.parametrize("name", ["margin, planar", "smoothed smallest sum"])
+@pytest.mark.parametrize(
+    "name", ["margin, planar", pytest.param("smoothed smallest sum", marks=pytest.mark.slow)]
+)
 def test_hessian_against_differences_of_the_gradient(name):
     function, problem = PLAIN[name]
     x = {
@@ -190,6 +197,7 @@ def test_hessian_against_differences_of_the_gradient(name):
     assert left == pytest.approx(float(mixed), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_vmap_of_grad_equals_the_batch():
     x = {k: v for k, v in as_arrays(planar_problem()).items() if k not in ("cap", "jacobian", "torque")}
     function = PLAIN["smoothed smallest sum"][0]

@@ -97,7 +97,11 @@ def oracle(grasp, components, wrench, criterion, parameter, cap, limit):
     return np.array([a for a, _, _ in answers]), np.array([c for _, c, _ in answers])
 
 
-@pytest.mark.parametrize("criterion", CRITERIA)
+FAST = ("gentlest",)
+MARKED = [pytest.param(n, marks=() if n in FAST else pytest.mark.slow) for n in CRITERIA]
+
+
+@pytest.mark.parametrize("criterion", MARKED)
 def test_clarabel_agrees(criterion):
     make, parameter = CRITERIA[criterion]
     for run, (name, limits, count) in enumerate(RUNS[criterion]):
@@ -110,8 +114,8 @@ def test_clarabel_agrees(criterion):
         both = optimal & (answer == "optimal")
         top = np.max(np.abs(np.asarray(out.force)), -1)
         scale = np.abs(best)
-            if criterion == "robust":
-                scale = scale + parameter + top
+        if criterion == "robust":
+            scale = scale + parameter + top
         error = np.abs(cost[both] - best[both]) / np.maximum(scale[both], 1e-300)
         contradictions = (optimal & (answer == "infeasible")) | (infeasible & (answer == "optimal"))
         print(

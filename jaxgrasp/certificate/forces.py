@@ -93,7 +93,8 @@ def check_forces(grasp, result, tolerance: float | None = None) -> np.ndarray:
     lanes_total = int(np.prod(shape))
     loads = lanes_total // max(grasps, 1)
     known = rebuild(grasp)
-    known = Rebuilt(*(_spread(x, loads) if isinstance(x, np.ndarray) else x for x in known))
+    arrays = {name: _spread(x, loads) for name, x in known._asdict().items() if isinstance(x, np.ndarray)}
+    known = known._replace(**arrays)
     n, live = len(known.components), known.live
     eps = float(np.finfo(dtype).eps)
 

@@ -59,7 +59,7 @@ class Frame(NamedTuple):
 
     def scale(self, x: Cone) -> Cone:
         """``W x`` in frame coordinates."""
-        factors = (self.along, self.against, *([self.across] * (len(x) - 2)))
+        factors: list = [self.along, self.against, *([self.across] * (len(x) - 2))]
         return tuple(f * a for f, a in zip(factors[: len(x)], x, strict=True))
 
     def head(self, value: Array) -> Cone:

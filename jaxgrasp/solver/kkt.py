@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from .._types import Array, pivot_tolerance
 from ..cones import Cone, cone_sum, inner
 from .blocks import Blocks, Frame, factor_blocks
-from .convex import Bounds, ConvexProgram, as_vector
+from .convex import Bounds, ConvexProgram, Optional, as_vector
 from .linear import Cholesky, cholesky, gram, matvec, rmatvec
 from .linear import solve as solve_factored
 from .stages import stage
@@ -31,7 +31,7 @@ class Direction(NamedTuple):
     """p in frame coordinates, dxi (L,) or None, dr (m + q, L)."""
 
     p: Cone
-    xi: Array | None
+    xi: Optional
     rows: Array
 
 
@@ -51,7 +51,7 @@ class KKT(NamedTuple):
     cholesky: Cholesky
     shaft: Shaft | None
 
-    def solve(self, h: Cone, head: Array, level: Array | None, rows: Array) -> Direction:
+    def solve(self, h: Cone, head: Array, level: Optional, rows: Array) -> Direction:
         """h in frame coordinates (k, L), head (k, L), level (L,), rows (m + q, L)."""
         start, target, along = _reduced(self.blocks, self.columns, self.shaft, h, head, level, rows)
         multipliers = solve_factored(self.cholesky, as_vector(target))
@@ -60,8 +60,8 @@ class KKT(NamedTuple):
 
 @stage
 def _reduced(
-    blocks: Blocks, columns: Cone, shaft: Shaft | None, h: Cone, head: Array, level: Array | None, rows: Array
-) -> tuple[Cone, Array, Array | None]:
+    blocks: Blocks, columns: Cone, shaft: Shaft | None, h: Cone, head: Array, level: Optional, rows: Array
+) -> tuple[Cone, Array, Optional]:
     start = tuple(a - b for a, b in zip(blocks.solve_lower(h), blocks.solve_head(head), strict=True))
     target = matvec(columns, start) - rows
     if shaft is None:
@@ -72,7 +72,7 @@ def _reduced(
 
 @stage
 def _expanded(
-    blocks: Blocks, columns: Cone, shaft: Shaft | None, start: Cone, along: Array | None, multipliers
+    blocks: Blocks, columns: Cone, shaft: Shaft | None, start: Cone, along: Optional, multipliers
 ) -> Direction:
     p = tuple(a - b for a, b in zip(start, rmatvec(columns, multipliers), strict=True))
     xi = None

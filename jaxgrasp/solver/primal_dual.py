@@ -30,7 +30,7 @@ from ..cones import (
     tail_inner,
 )
 from .blocks import Frame, frame_of
-from .convex import Bounds, ConvexProgram, Point
+from .convex import Bounds, ConvexProgram, Optional, Point
 from .interior_point import Stop, nesterov_todd
 from .kkt import Direction, factor
 from .stages import stage
@@ -67,7 +67,7 @@ class Step(NamedTuple):
     q: Cone
     u: Cone
     z: Cone
-    xi: Array | None
+    xi: Optional
     rows: Array
     slack: Bounds
     price: Bounds
@@ -187,7 +187,7 @@ def _right_hand_side(
     scalar: Bounds,
     share: Array,
     drive: Array,
-) -> tuple[Cone, Bounds, Array, Array | None, Array]:
+) -> tuple[Cone, Bounds, Array, Optional, Array]:
     """h, the gains ``target / slack - price``, and the head, level and rows of the Newton system."""
     exists = program.exists
     head = (lam[0] * cone[0] - tail_inner(lam, cone)) / determinant(lam)
