@@ -19,7 +19,7 @@ from .cones import Cone, cone_max, cone_sum, tail_norm
 from .contacts import Component
 from .criteria import Criterion
 from .lanes import to_lanes
-from .margin import Contacts, Folded, Projection, to_twist
+from .margin import Contacts, Folded, Projection
 from .solver.convex import Bounds, ConvexProgram, Curvature, Point, as_vector
 from .solver.linear import Vector, null_combination, rmatvec, solve_lower
 from .solver.stages import stage
@@ -396,8 +396,3 @@ def power_left(program: ConvexProgram, rows: Array, limit: float) -> Array:
 def proves(program: ConvexProgram, rows: Array) -> Array:
     """Whether ``rows`` prove that no forces up to ``FORCE_LIMIT`` times the load balance it."""
     return power_left(program, rows, FORCE_LIMIT) > 0.5
-
-
-def twist_of(projection: Projection, y: Array) -> Vector:
-    """The twist of A for multipliers of Q."""
-    return to_twist(projection, as_vector(y))

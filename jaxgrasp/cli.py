@@ -1,4 +1,4 @@
-"""The command line: parse, call, print. ``jaxgrasp screen``, ``explain``, ``objects``."""
+"""The command line: parse, call, print. ``jaxgrasp screen``, ``explain``, ``objects`` (``forces``: ``cli_forces``)."""
 
 from __future__ import annotations
 
@@ -9,17 +9,11 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TextColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 
+from .cli_forces import FORCES_HELP, explain_forces, forces
 from .errors import UserError
+from .terminal import ProgressBar, counts, numbers, quantiles, say, speed
 
 __all__ = ["app", "main"]
 
@@ -57,12 +51,9 @@ Examples:
   jaxgrasp explain mug.grasps.parquet 17
 
   jaxgrasp explain mug.grasps.parquet 17 --picture grasp.png
+
+  jaxgrasp explain forces.parquet 17
 """
-
-
-def _say(text: str) -> None:
-    """One line on stderr."""
-    print(f"jaxgrasp: {' '.join(str(text).split())}", file=sys.stderr)
 
 
 def _version(wanted: bool) -> None:
@@ -80,20 +71,6 @@ def _options(
     ] = False,
 ) -> None:
     pass
-
-
-def _com(text: str | None) -> tuple[float, ...] | None:
-    if text is None:
-        return None
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        values = ()
-    if len(values) != 3:
-        raise UserError(
-            f"--com must be three numbers x,y,z in m without spaces, such as 0,0,0.05, got {text!r}"
-        )
-    return values
 
 
 @app.command(help=SCREEN_HELP)
@@ -153,11 +130,12 @@ def screen(
     from .backend import precision, remember_compilations, usable_backend
     from .run import Request, prepare
     from .screening import screen as start
+    from .status import Status
 
-    centre = _com(com)
+    centre = numbers(com, "--com", (3,), "three numbers x,y,z in m without spaces, such as 0,0,0.05")
     if threads is not None and threads < 1:
         raise UserError(f"--threads must be at least 1, got {threads}")
-    usable_backend(_say)
+    usable_backend(say)
     remember_compilations()
     request = Request(
         source, output, fingers, model, friction, torsion, samples, seed, unit, centre, dtype, tolerance,
@@ -166,104 +144,37 @@ def screen(
     with precision(dtype):
         run = prepare(request)
         for warning in run.warnings:
-            _say(f"warning: {warning}")
+            say(f"warning: {warning}")
         console = Console(stderr=True)
         try:
-            with _Bar(console, run.candidates) as bar:
+            with ProgressBar(console, run.candidates, Status.RESISTANT, "sampling") as bar:
                 summary = start(run, resume, bar.show)
         except KeyboardInterrupt:
             again = "" if resume else " and --resume"
-            _say(f"stopped; the finished part is in {run.output}.parts: go on with the same command{again}")
+            say(f"stopped; the finished part is in {run.output}.parts: go on with the same command{again}")
             raise
     _print_summary(summary, run)
 
 
-class _Bar:
-    """Progress on a terminal: done, rate, share resistant, time left."""
-
-    def __init__(self, console: Console, total: int):
-        self.progress = Progress(
-            SpinnerColumn(),
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[told]}"),
-            TimeRemainingColumn(),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
-        )
-        self.task = self.progress.add_task("sampling", total=total, told="")
-
-    def __enter__(self) -> _Bar:
-        self.progress.start()
-        return self
-
-    def __exit__(self, *_) -> None:
-        self.progress.stop()
-
-    def show(self, summary) -> None:
-        from .status import Status
-
-        if not summary.solved:
-            self.progress.update(self.task, description="compiling", completed=summary.done)
-            return
-        rate = (summary.done - summary.resumed) / max(summary.seconds, 1e-9)
-        told = f"{rate:,.0f} grasps/s, {100 * summary.share(Status.RESISTANT):.1f} % resistant"
-        stage = "writing" if summary.done >= summary.candidates else "solving"
-        self.progress.update(self.task, description=stage, completed=summary.done, told=told)
-
-
 def _print_summary(summary, run) -> None:
-    from .status import Status
-
     console = Console()
     about = run.metadata.get("contacts") or run.metadata["object"]
     name = Path(about["name"]).name
-    table = Table(title=f"{name}: {summary.rows:,} grasps")
-    table.add_column("verdict")
-    table.add_column("grasps", justify="right")
-    table.add_column("share", justify="right")
-    for status in Status:
-        if summary.counts.get(status):
-            words = status.name.replace("_", " ").lower()
-            table.add_row(words, f"{summary.counts[status]:,}", f"{100 * summary.share(status):.2f} %")
-    for reason, number in summary.removed.items():
-        table.add_row(f"left out by --filter: {reason}", f"{number:,}", "")
-    console.print(table)
-    quantiles = (
-        ("min", 0.0),
-        ("5 %", 0.05),
-        ("25 %", 0.25),
-        ("median", 0.5),
-        ("75 %", 0.75),
-        ("95 %", 0.95),
-        ("max", 1.0),
-    )
-    margins = Table(title="margin (a lower bound)" if run.verdict_only else "margin")
-    values = []
-    for words, q in quantiles:
-        margins.add_column(words, justify="right")
-        values.append(f"{summary.quantile(q):.3f}")
-    margins.add_row(*values)
-    console.print(margins)
+    console.print(counts(summary, f"{name}: {summary.rows:,} grasps", "verdict"))
+    console.print(quantiles(summary, "margin (a lower bound)" if run.verdict_only else "margin", ".3f"))
     if summary.solved:
-        solver = summary.solved / max(summary.solve_seconds, 1e-9)
-        overall = (summary.done - summary.resumed) / max(summary.seconds, 1e-9)
-        console.print(
-            f"{overall:,.0f} grasps/s overall, {solver:,.0f} in the solver; {summary.seconds:.1f} s"
-            f" after {summary.compile_seconds:.1f} s of compiling",
-            highlight=False,
-            soft_wrap=True,
-        )
+        console.print(speed(summary), highlight=False, soft_wrap=True)
     if summary.resumed:
         console.print(f"{summary.resumed:,} candidates were already done", highlight=False)
     console.print(f"written to {run.output}", highlight=False, soft_wrap=True)
 
 
+app.command(help=FORCES_HELP)(forces)
+
+
 @app.command(help=EXPLAIN_HELP)
 def explain(
-    file: Annotated[Path, typer.Argument(help="A file that jaxgrasp screen wrote.")],
+    file: Annotated[Path, typer.Argument(help="A file that jaxgrasp screen or jaxgrasp forces wrote.")],
     row: Annotated[int, typer.Argument(help="Which row, counted from 0.")],
     picture: Annotated[Path | None, typer.Option(help="Draw the grasp to this file (png, svg, pdf).")] = None,
     object: Annotated[
@@ -271,11 +182,18 @@ def explain(
     ] = None,
 ) -> None:
     from .backend import usable_backend
-    from .formats.parquet import read_row
+    from .formats.parquet import read_metadata, read_row
     from .report import Verdict, draw, reprove
     from .report import explain as words
 
-    usable_backend(_say)
+    usable_backend(say)
+    if "load" in read_metadata(file):
+        if picture is not None or object is not None:
+            raise UserError(
+                f"{file} holds forces against a load; --picture draws verdicts that jaxgrasp screen wrote"
+            )
+        explain_forces(file, row)
+        return
     values, metadata = read_row(file, row)
     verdict = Verdict.from_row(values, metadata)
     print(f"Row {row} of {file} (grasp {values['grasp_id']}, {verdict.model} contacts):")
@@ -293,17 +211,17 @@ def _mesh(source: str | None, metadata: dict):
     known = metadata.get("object") or {}
     name = source or known.get("name")
     if name is None:
-        _say("the file does not name its object: drawing the contacts only (--object names a mesh)")
+        say("the file does not name its object: drawing the contacts only (--object names a mesh)")
         return None
     try:
         body = meshes.load(name, metadata.get("unit", "m"))
     except UserError as error:
         if source is not None:
             raise
-        _say(f"{error}: drawing the contacts only (--object names the mesh)")
+        say(f"{error}: drawing the contacts only (--object names the mesh)")
         return None
     if known.get("sha256") not in (None, body.sha256):
-        _say(f"warning: {name} is not the file these grasps were made on")
+        say(f"warning: {name} is not the file these grasps were made on")
     return body.mesh
 
 
@@ -338,7 +256,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         code = app(args=arguments, standalone_mode=False)
     except UserError as error:
-        _say(str(error))
+        say(str(error))
         return 2
     except (KeyboardInterrupt, typer.Abort):
         return 130
@@ -352,6 +270,6 @@ def main(arguments: list[str] | None = None) -> int:
         message = getattr(error, "format_message", None)
         if message is None:
             raise
-        _say(f"{message()} (jaxgrasp --help shows what there is)")
+        say(f"{message()} (jaxgrasp --help shows what there is)")
         return 2
     return code if isinstance(code, int) else 0

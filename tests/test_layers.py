@@ -30,6 +30,7 @@ FLOORS = [
     "solver.convex",
     "solver.blocks",
     "solver.kkt",
+    "solver.steps",
     "solver.primal_dual",
     "solver.implicit",
     "solver",

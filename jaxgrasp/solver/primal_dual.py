@@ -34,6 +34,7 @@ from .convex import Bounds, ConvexProgram, Optional, Point
 from .interior_point import Stop, nesterov_todd
 from .kkt import Direction, factor
 from .stages import stage
+from .steps import cone_reach, rejoined
 
 __all__ = ["Answered", "State", "begin", "solve"]
 
@@ -105,14 +106,6 @@ def _frame(w: Cone, eta: Array, z: Cone) -> tuple[Frame, Cone]:
     """The frame of the scaling, and lambda = W z in rotated coordinates."""
     frame = frame_of(w, eta)
     return frame, rejoined(frame.scale(frame.to_frame(z)))
-
-
-def rejoined(x: Cone) -> Cone:
-    """Frame coordinates to head and rotated tails, and back: the same reflection."""
-    if len(x) == 1:
-        return x
-    half = jnp.asarray(0.5**0.5, x[0].dtype)
-    return ((x[0] + x[1]) * half, (x[0] - x[1]) * half, *x[2:])
 
 
 @stage
@@ -237,22 +230,6 @@ def _completed(
     return Step(p, q, du, tuple(exists * x for x in dz), solution.xi, rows, slack, price)
 
 
-def _cone_rate(lam: Cone, direction: Cone) -> Array:
-    """Rate at which ``lam + t direction`` runs into its cone. Source: Vandenberghe 2010, section 8."""
-    root = lax.rsqrt(determinant(lam))
-    bar = tuple(a * root for a in lam)
-    first = bar[0] * direction[0] - tail_inner(bar, direction)
-    shift = (first + direction[0]) / (1 + bar[0])
-    tails = tuple(a - shift * b for a, b in zip(direction[1:], bar[1:], strict=True))
-    size = jnp.sqrt(inner(tails, tails)) if tails else jnp.zeros_like(first)
-    return (size - first) * root
-
-
-@stage
-def _cone_reach(exists: Array, lam: Cone, p: Cone, q: Cone) -> Array:
-    return cone_max(exists * jnp.maximum(_cone_rate(lam, p), _cone_rate(lam, q)))
-
-
 @stage
 def _reach(reach: Array, masks: Bounds, point: Point, step: Step) -> Array:
     """The largest rate over all inequalities; the step to the boundary is 1 / rate, and at most 1."""
@@ -306,7 +283,7 @@ def newton_step(program: ConvexProgram, point: Point, excess: Array, closed: Arr
         h, gains, head, level, rows = _right_hand_side(program, point, local, lam, cone, scalar, share, drive)
         solution = kkt.solve(in_frame(h), head, level, rows)
         step = _completed(program, local, frame, h, gains, share, solution)
-        reach = _cone_reach(program.exists, lam, step.p, step.q)
+        reach = cone_reach(program.exists, lam, step.p, step.q)
         return step, _reach(reach, local.masks, point, step)
 
     zero, one = jnp.zeros_like(excess), jnp.ones_like(excess)
