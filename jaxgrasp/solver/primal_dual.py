@@ -34,7 +34,7 @@ from .convex import Bounds, ConvexProgram, Optional, Point
 from .interior_point import Stop, nesterov_todd
 from .kkt import Direction, factor
 from .stages import stage
-from .steps import cone_reach, rejoined
+from .steps import cone_reach, in_frame, reciprocal, rejoined
 
 __all__ = ["Answered", "State", "begin", "solve"]
 
@@ -248,11 +248,6 @@ def _moved(point: Point, step: Step, length: Array) -> Point:
 
 
 @stage
-def _reciprocal(x: Array) -> Array:
-    return 1 / x
-
-
-@stage
 def _centring(before: Array, after: Array, count: Array, closed: Array) -> tuple[Array, Array, Array, Array]:
     """Mehrotra's ``sigma = ratio^3``; the target mu, the drive, the fraction of the way to the boundary."""
     ratio = jnp.minimum(jnp.maximum(after / before, jnp.zeros_like(after)), jnp.ones_like(after))
@@ -288,7 +283,7 @@ def newton_step(program: ConvexProgram, point: Point, excess: Array, closed: Arr
 
     zero, one = jnp.zeros_like(excess), jnp.ones_like(excess)
     affine, reach = direction(zero, one, one, one, None)
-    length = _reciprocal(reach)
+    length = reciprocal(reach)
     ahead = _moved(point, affine, length)
     after, count = _measure(program, ahead.u, ahead.z, ahead.slack, ahead.price)
     mu, share, drive, fraction = _centring(excess, after, count, closed)
@@ -296,11 +291,6 @@ def newton_step(program: ConvexProgram, point: Point, excess: Array, closed: Arr
     weight = one if program.cone_floor is None and program.smoothing is None else length
     step, reach = direction(mu, share, drive, weight, affine)
     return _moved(point, step, _length(reach, fraction)), step
-
-
-@stage
-def in_frame(h: Cone) -> Cone:
-    return rejoined(h)
 
 
 @stage
