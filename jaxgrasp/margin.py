@@ -329,11 +329,13 @@ def _gauge(exists: Array, count: Array, v: Cone) -> Array:
 def upper_bound(folded: Folded, y: Vector) -> Array:
     """``1 + a.y / rho(y)`` with ``rho(y) = k max_i (v_n,i + |v_t,i|) - sum_i v_n,i``, ``v = A^T y``: t* is not larger.
 
-    1 / rho is the largest multiple of y that the dual admits, so the bound needs no feasible y.
+    1 / rho is the largest multiple of y that the dual admits, so the bound needs no feasible y. rho grows by the
+    rounding of v: where t* is hugely negative it is the small difference of large sums, and t* follows it squared.
     """
     zero = tuple(jnp.zeros_like(folded.exists) for _ in folded.columns)
     v = _removed(folded.columns, zero, tuple(-x for x in y))
-    gauge = _gauge(folded.exists, folded.count, v)
+    rounding = 4 * unit_roundoff(folded.norm.dtype) * folded.count * _size(y)
+    gauge = _gauge(folded.exists, folded.count, v) + rounding
     descent = folded.resultant[0] * y[0]
     for a, b in zip(folded.resultant[1:], y[1:], strict=True):
         descent = descent + a * b

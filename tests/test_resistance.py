@@ -333,7 +333,8 @@ def test_wrong_structure_raises_at_trace_time(batch):
 
 
 def test_status_numbers_and_sentences_are_fixed():
-    assert [s.value for s in Status] == [1, 2, 3, 4, 5]
+    assert [s.value for s in Status] == [1, 2, 3, 4, 5, 6, 7, 8]
+    assert [Status(i).name for i in (6, 7, 8)] == ["OPTIMAL", "INFEASIBLE", "STALLED"]
     assert all(s.sentence.endswith(".") for s in Status)
     assert [s.value for s in Stop] == [0, 1, 2, 3, 4, 5]
     assert all(s.sentence.endswith(".") for s in Stop)
