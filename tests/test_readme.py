@@ -95,6 +95,12 @@ def test_the_python_example_prints_what_is_shown(tmp_path):
     same_words(block("example output"), printed)
 
 
+def test_the_forces_example_prints_what_is_shown(tmp_path):
+    printed = run("-c", block("forces example"), cwd=tmp_path)
+    assert "d cost / d mu = -6.0000 N" in printed  # W / (2 mu), differentiated
+    same_words(block("forces example output"), printed)
+
+
 def test_explain_prints_what_is_shown(tmp_path):
     """A row depends on the seed and its number alone, so 300 samples hold the README's rows."""
     action = block("main command").split(" && ")[1].split()
