@@ -177,31 +177,37 @@ def _quadratic_bound(program: ConvexProgram, pull: Pull, u: Cone) -> Array:
 def _barrier_bound(program: ConvexProgram, pull: Pull, u: Cone) -> Array:
     """Dual value of the fixed barriers: ``sum phi - phi log phi + phi/2 log det z + psi - psi log psi + psi log p``.
 
-    p and z are those of the forces u; the level's multipliers, of sum 1, supply what z lacks, the dearest caps first.
+    Where u_0 is at its level, ``phi z_0 / det z = psi / p = level`` fixes z_0 and p; elsewhere p is that of the forces.
+    The level's multipliers, of sum 1, supply what z lacks, the dearest caps first; the largest u_0
+    takes the rest, which is worth most there.
     """
     exists, x = program.exists, pull.x
     phi, psi = program.cone_floor, program.head_floor
     assert phi is not None and psi is not None
     zero, one = jnp.zeros_like(exists), jnp.ones_like(exists)
-    det = jnp.where((exists > 0) & (phi > 0), determinant(u), one)
-    price = jnp.where(exists > 0, psi / jnp.where(exists > 0, u[0], one), zero)
+    top = _top(exists, u)
+    level, leads = top + zero, exists * jnp.where(u[0] >= top, one, zero)
+    if program.cap is not None:
+        level = jnp.minimum(level, program.cap)
     tail = tail_norm(x)
-    wanted = jnp.where(phi > 0, phi * u[0] / det, tail)
-    needed = exists * jnp.maximum(wanted + price - x[0], zero)
+    wanted = jnp.where(phi > 0, (phi + jnp.sqrt(phi * phi + (2 * level * tail) ** 2)) / (2 * level), tail)
+    needed = exists * jnp.maximum(wanted + psi / level - x[0], zero)
+    price = exists * psi / jnp.where((exists > 0) & (needed <= 0), u[0], level)
     share = _covered(needed, program.cap, one[0])
     paid, over = jnp.zeros_like(one[0]), zero
     if program.cap is not None:
         finite = jnp.isfinite(program.cap) & (exists > 0)
         over = jnp.where(finite, needed - share, zero)
         paid = cone_sum(over * jnp.where(finite, program.cap, zero))
-    spare = jnp.maximum(one[0] - cone_sum(share), zero[0]) / cone_sum(exists)
-    head = share + exists * spare + over + x[0] - price
+    spare = jnp.maximum(one[0] - cone_sum(share), zero[0]) / jnp.maximum(cone_sum(leads), one[0])
+    head = share + leads * spare + over + x[0]
+    price = jnp.where(
+        phi > 0, price, exists * (head - tail)
+    )  # without a barrier z only needs to be in its cone
+    head = head - price
     z = (jnp.where(exists > 0, head, one), *(exists * v for v in x[1:]))
-    inside = interior_distance(z)
-    value = _conjugate(phi, jnp.where(inside > 0, determinant(z), zero), 0.5) + _conjugate(psi, price, 1.0)
-    # A contact without barrier only needs z in its cone.
-    blur = 4 * unit_roundoff(one.dtype) * (1 + tail)
-    value = jnp.where((phi == 0) & (inside < -blur), jnp.full_like(value, -jnp.inf), value)
+    det = jnp.where(interior_distance(z) > 0, determinant(z), zero)
+    value = _conjugate(phi, det, 0.5) + _conjugate(psi, price, 1.0)
     return pull.gain - paid + cone_sum(jnp.where(exists > 0, value, zero))
 
 
@@ -311,15 +317,11 @@ def answer(
 
     escape = to_twist(projection, as_vector(ray[:m]))
     multiplier = to_twist(projection, as_vector(rows[:m]))
-    load = load._replace(rest=_both(load.rest, weight is None))
+    load = load._replace(rest=load.rest & (weight is None))
     return _read_back(
         status, u, cost, bound, escape, multiplier, rows, ray, folded, load, problem.row_norm, contacts,
          components, dimension, program.curvature is not None,
     )  # fmt: skip
-
-
-def _both(flag: Array, also: bool) -> Array:
-    return flag if also else jnp.zeros_like(flag)
 
 
 @stage

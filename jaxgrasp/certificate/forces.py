@@ -164,7 +164,7 @@ def check_forces(grasp, result, tolerance: float | None = None) -> np.ndarray:
         allowed = np.maximum(allowed, 4 * smooth * (3 * k + 2 * torque.shape[-1]))
         optimal = (
             met
-            & (np.abs(value - cost) <= room)
+            & (np.abs(value - cost) <= room + fine * _logarithmic(known, name, s, weight, dimension))
             & (bound <= best + room + fine * power)
             & (value - best <= allowed)
         )
@@ -211,6 +211,16 @@ def _cost(known: Rebuilt, name: str, s, weight, length, dimension: int) -> tuple
     return value, value
 
 
+def _logarithmic(known: Rebuilt, name: str, s, weight, dimension: int) -> np.ndarray | float:
+    """What a relative error of the forces is worth in the robust cost: ``weight sum b f_n / (f_n - psi)``."""
+    if name != "Robust":
+        return 0.0
+    _, b, _ = _log_det_terms(known, dimension)
+    head, tail = s[..., 0], np.linalg.norm(s[..., 1:], axis=-1)
+    counted = known.live & (b > 0) & (head > tail)
+    return weight * np.sum(np.where(counted, b * head / np.where(counted, head - tail, 1.0), 0.0), -1)
+
+
 def _bound(known, name, s, weight, length, cap, torque, jacobian, load, y, rates, dimension) -> np.ndarray:
     """A lower bound of every admissible force's cost, from the twist y and the joint rates (formulas above)."""
     live = known.live
@@ -242,20 +252,19 @@ def _robust_bound(known: Rebuilt, s, weight, cap, x, gain, dimension: int) -> np
     live = known.live
     a, b, c = _log_det_terms(known, dimension)
     phi, psi = 2 * weight[:, None] * b, weight[:, None] * a
-    head, tail = s[..., 0], np.linalg.norm(s[..., 1:], axis=-1)
-    det = np.where(live & (b > 0), (head - tail) * (head + tail), 1.0)
-    p = np.where(psi > 0, psi / np.where(live, head, 1.0), 0.0)
+    head = np.where(live, s[..., 0], 0.0)
+    level = np.minimum(head.max(-1, keepdims=True), cap)
     x_tail = np.linalg.norm(x[..., 1:], axis=-1)
-    z_head = np.where(b > 0, phi * head / det, x_tail)
-    needed = np.where(live, np.maximum(z_head + p - x[..., 0], 0.0), 0.0)
+    z_head = np.where(phi > 0, (phi + np.hypot(phi, 2 * level * x_tail)) / (2 * level), x_tail)
+    needed = np.where(live, np.maximum(z_head + psi / level - x[..., 0], 0.0), 0.0)
+    p = psi / np.where(live & (needed <= 0), s[..., 0], level)
     share = _top_share(needed, cap)
     alpha = np.where(np.isfinite(cap), needed - share, 0.0)
-    spare = (
-        np.maximum(1.0 - share.sum(-1, keepdims=True), 0.0)
-        * live
-        / np.maximum(live.sum(-1, keepdims=True), 1)
-    )
-    z_head = share + spare + alpha + x[..., 0] - p
+    leads = live & (head >= head.max(-1, keepdims=True))
+    spare = np.maximum(1.0 - share.sum(-1, keepdims=True), 0.0) * leads / leads.sum(-1, keepdims=True)
+    z_head = share + spare + alpha + x[..., 0]
+    p = np.where(phi > 0, p, z_head - x_tail)  # without a barrier z only needs to be in its cone
+    z_head = z_head - p
     z_det = (z_head - x_tail) * (z_head + x_tail)
 
     def conjugate(floor, value, power):
