@@ -178,8 +178,8 @@ def _barrier_bound(program: ConvexProgram, pull: Pull, u: Cone) -> Array:
     """Dual value of the fixed barriers: ``sum phi - phi log phi + phi/2 log det z + psi - psi log psi + psi log p``.
 
     Where u_0 is at its level, ``phi z_0 / det z = psi / p = level`` fixes z_0 and p; elsewhere p is that of the forces.
-    The level's multipliers, of sum 1, supply what z lacks, the dearest caps first; the largest u_0
-    takes the rest, which is worth most there.
+    The level's multipliers, of sum 1, supply what z lacks, the dearest caps first; what is left is
+    worth most at the largest u_0.
     """
     exists, x = program.exists, pull.x
     phi, psi = program.cone_floor, program.head_floor
@@ -201,9 +201,8 @@ def _barrier_bound(program: ConvexProgram, pull: Pull, u: Cone) -> Array:
         paid = cone_sum(over * jnp.where(finite, program.cap, zero))
     spare = jnp.maximum(one[0] - cone_sum(share), zero[0]) / jnp.maximum(cone_sum(leads), one[0])
     head = share + leads * spare + over + x[0]
-    price = jnp.where(
-        phi > 0, price, exists * (head - tail)
-    )  # without a barrier z only needs to be in its cone
+    # A contact without barrier only needs z in its cone.
+    price = jnp.where(phi > 0, price, exists * (head - tail))
     head = head - price
     z = (jnp.where(exists > 0, head, one), *(exists * v for v in x[1:]))
     det = jnp.where(interior_distance(z) > 0, determinant(z), zero)

@@ -263,7 +263,8 @@ def _robust_bound(known: Rebuilt, s, weight, cap, x, gain, dimension: int) -> np
     leads = live & (head >= head.max(-1, keepdims=True))
     spare = np.maximum(1.0 - share.sum(-1, keepdims=True), 0.0) * leads / leads.sum(-1, keepdims=True)
     z_head = share + spare + alpha + x[..., 0]
-    p = np.where(phi > 0, p, z_head - x_tail)  # without a barrier z only needs to be in its cone
+    # A contact without barrier only needs z in its cone.
+    p = np.where(phi > 0, p, z_head - x_tail)
     z_head = z_head - p
     z_det = (z_head - x_tail) * (z_head + x_tail)
 
@@ -272,8 +273,7 @@ def _robust_bound(known: Rebuilt, s, weight, cap, x, gain, dimension: int) -> np
         logs = np.where(value > 0, np.log(np.where(value > 0, value, 1.0)), -np.inf)
         return np.where(floor > 0, safe - safe * np.log(safe) + power * safe * logs, 0.0)
 
-    inside = z_head >= x_tail * (1 - ROUNDING * EPS) - ROUNDING * EPS
     pieces = conjugate(phi, np.where(z_head > x_tail, z_det, 0.0), 0.5) + conjugate(psi, p, 1.0)
-    pieces = np.where(inside, pieces - weight[:, None] * c, -np.inf)
+    pieces = pieces - weight[:, None] * c
     paid = np.sum(np.where(alpha > 0, alpha * np.where(np.isfinite(cap), cap, 0.0), 0.0), -1)
     return gain - paid + np.sum(np.where(live, pieces, 0.0), -1)
