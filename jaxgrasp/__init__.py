@@ -30,13 +30,17 @@ from .lmi import (
     LMIFeasibility,
     LMIProblem,
     LMISolution,
+    LogDetTerm,
+    SDPSolution,
     friction_lmi,
     lmi_feasibility,
     lmi_margin,
     lmi_minimize,
     margin_lmi,
+    sdp_minimize,
     second_order_cone_lmi,
 )
+from .lmi_forces import LMIForces, lmi_forces
 from .resistance import WrenchResistance, wrench_resistance
 from .solver import Stop
 from .status import Status
@@ -64,10 +68,13 @@ __all__ = [
     "lmi_margin",
     "lmi_minimize",
     "lmi_feasibility",
+    "sdp_minimize",
     "second_order_cone_lmi",
     "LMIProblem",
+    "LogDetTerm",
     "LMISolution",
     "LMIFeasibility",
+    "SDPSolution",
     # 11.2 wrench resistance (force closure)
     "wrench_resistance",
     "WrenchResistance",
@@ -92,6 +99,8 @@ __all__ = [
     "Squeeze",
     "resistible_wrenches",
     "ResistibleWrenches",
+    "lmi_forces",
+    "LMIForces",
     # answers and their proofs
     "Status",
     "check_certificate",

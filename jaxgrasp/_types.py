@@ -78,3 +78,11 @@ def rounding_constant() -> float:
     Twice the checker's, so that what the solver certifies the checker accepts.
     """
     return 32.0
+
+
+def proven_limit(dtype) -> float:
+    """Loads: a twist must exclude forces up to this many for INFEASIBLE; the checker asks for 1e6.
+
+    In float32 rounding of the twist itself takes a part of the difference.
+    """
+    return 2e6 if jnp.dtype(dtype).itemsize == 8 else 1e7

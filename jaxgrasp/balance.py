@@ -21,7 +21,7 @@ from .criteria import Criterion
 from .lanes import to_lanes
 from .margin import Contacts, Folded, Projection
 from .solver.convex import Bounds, ConvexProgram, Curvature, Point, as_vector
-from .solver.linear import Vector, null_combination, rmatvec, solve_lower
+from .solver.linear import Vector, null_combination, rmatvec, solve_lower, vector_norm
 from .solver.stages import stage
 
 __all__ = ["Balance", "Demand", "Load", "balance", "starting_point"]
@@ -94,20 +94,13 @@ def _load_size(
 ) -> tuple[Array, Array, Array, Array]:
     """b, the size, whether the load is off the range, whether there is none."""
     dtype = norm.dtype
-    size, leftover, outer = _norm(inner), _norm(left), _norm(wrench)
+    size, leftover, outer = vector_norm(inner), vector_norm(left), vector_norm(wrench)
     rounding = jnp.asarray(256 * unit_roundoff(dtype), dtype) * (outer + norm * size)
     off = leftover > rounding
     rest = outer == 0
     total = size if weight is None else size + weight
     total = jnp.where(total > 0, total, jnp.ones_like(total))
     return jnp.stack([-x / total for x in inner]), total, off, rest
-
-
-def _norm(v: Vector) -> Array:
-    total = v[0] * v[0]
-    for x in v[1:]:
-        total = total + x * x
-    return jnp.sqrt(total)
 
 
 def load(folded: Folded, projection: Projection, demand: Demand, dimension: int) -> tuple[Load, Array]:

@@ -1,7 +1,7 @@
 """The friction LMI of a grasp, its reduction to Null(G), and the margin by this road (11.9)-(11.17).
 
 The second road to every answer of section 11.2: small and general, for teaching and for checking the
-structured solver. The method that solves an LMI is in barrier.py.
+structured solver. The methods that solve LMIs are in barrier.py and semidefinite.py.
 """
 
 from __future__ import annotations
@@ -12,27 +12,30 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ._types import Array, Bool, Float, rank_tolerance
-from .barrier import (
+from .barrier import lmi_minimize
+from .grasp import Grasp, null_space
+from .lmi_problem import LMIProblem, LMISolution, LogDetTerm, expect_shape
+from .semidefinite import (
     LMIFeasibility,
-    LMIProblem,
-    LMISolution,
-    expect_shape,
+    SDPSolution,
     lmi_feasibility,
-    lmi_minimize,
+    sdp_minimize,
     second_order_cone_lmi,
 )
-from .grasp import Grasp, null_space
 
 __all__ = [
     "FrictionLMI",
     "LMIFeasibility",
     "LMIProblem",
     "LMISolution",
+    "LogDetTerm",
+    "SDPSolution",
     "friction_lmi",
     "lmi_feasibility",
     "lmi_margin",
     "lmi_minimize",
     "margin_lmi",
+    "sdp_minimize",
     "second_order_cone_lmi",
 ]
 
@@ -146,6 +149,15 @@ def _margin_problem(grasp: Grasp) -> tuple[LMIProblem, Bool[Array, "*batch"]]:
     return LMIProblem(cost, constant, matrices, start), squeezes
 
 
+def is_grasp(grasp: Grasp) -> Bool[Array, "*batch"]:
+    """Whether the numbers of the active contacts, at least one, describe a grasp: finite, a normal, mu, gamma >= 0."""
+    mu, gamma = grasp.model.friction_coefficient, grasp.model.torsion_coefficient
+    valid = jnp.all(~grasp.active | ((mu >= 0) & (gamma >= 0)), axis=-1) & jnp.any(grasp.active, axis=-1)
+    finite = jnp.all(jnp.isfinite(grasp.position) & jnp.isfinite(grasp.normal), axis=-1)
+    valid &= jnp.all(~grasp.active | (finite & jnp.any(grasp.normal != 0, axis=-1)), axis=-1)
+    return valid & jnp.all(~grasp.active | (jnp.isfinite(mu) & jnp.isfinite(gamma)), axis=-1)
+
+
 @eqx.filter_jit
 def lmi_margin(grasp: Grasp, tolerance: float = 1e-8) -> Float[Array, "*batch"]:
     """``t* = max t  subject to  G f = 0,  f_n,i - psi_i(f_i) >= t,  sum_i f_n,i = k``: the margin,
@@ -157,9 +169,4 @@ def lmi_margin(grasp: Grasp, tolerance: float = 1e-8) -> Float[Array, "*batch"]:
     """
     problem, squeezes = _margin_problem(grasp)
     margin = -lmi_minimize(problem, tolerance).value
-    mu, gamma = grasp.model.friction_coefficient, grasp.model.torsion_coefficient
-    valid = jnp.all(~grasp.active | ((mu >= 0) & (gamma >= 0)), axis=-1) & jnp.any(grasp.active, axis=-1)
-    finite = jnp.all(jnp.isfinite(grasp.position) & jnp.isfinite(grasp.normal), axis=-1)
-    valid &= jnp.all(~grasp.active | (finite & jnp.any(grasp.normal != 0, axis=-1)), axis=-1)
-    valid &= jnp.all(~grasp.active | (jnp.isfinite(mu) & jnp.isfinite(gamma)), axis=-1)
-    return jnp.where(valid, jnp.where(squeezes, margin, -jnp.inf), jnp.nan)
+    return jnp.where(is_grasp(grasp), jnp.where(squeezes, margin, -jnp.inf), jnp.nan)

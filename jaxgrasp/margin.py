@@ -30,6 +30,7 @@ from .solver.linear import (
     orthonormal_rows,
     rmatvec,
     solve_transposed,
+    vector_norm,
 )
 from .solver.stages import stage
 
@@ -43,6 +44,8 @@ __all__ = [
     "starting_point",
     "upper_bound",
 ]
+
+_size = stage(vector_norm)
 
 START_DEPTH = 0.3  # how far inside the cones the first forces lie, relative to their tangential size
 
@@ -295,14 +298,6 @@ def starting_point(folded: Folded, projection: Projection) -> Start:
     keep = escape | unbounded
     dual = tuple(jnp.where(keep, -v, jnp.zeros_like(v)) for v in y)
     return Start(Iterate(dual, u, z), lower, escape, unbounded)
-
-
-@stage
-def _size(y: Vector) -> Array:
-    square = y[0] * y[0]
-    for v in y[1:]:
-        square = square + v * v
-    return jnp.sqrt(square)
 
 
 @stage

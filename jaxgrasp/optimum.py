@@ -1,7 +1,6 @@
 """From a solved force problem to its answer with proof: forces, cost, bound, twists, in the caller's units.
 
-The bound is the dual function at the twist the solver ended with, in closed form for every criterion, so it holds
-whatever the solver did. ``certificate.py`` evaluates the same formulas again from the answer alone.
+Nothing is claimed that was not proven: the cost and its bound (``duality``), or the load's power along a twist.
 """
 
 from __future__ import annotations
@@ -10,22 +9,21 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from ._types import Array, rounding_constant, unit_roundoff
-from .balance import Balance, Demand, power_left
-from .cones import Cone, cone_max, cone_sum, determinant, inner, interior_distance, tail_norm
+from ._types import Array, proven_limit, rounding_constant, unit_roundoff
+from .balance import Balance, Demand, Load
+from .cones import Cone, cone_max, cone_sum, inner, interior_distance, tail_norm
 from .contacts import Component
+from .duality import criterion_value, dual_value
 from .lanes import to_lanes
 from .margin import Contacts, Folded, Projection, to_twist
 from .solver import Stop
-from .solver.convex import ConvexProgram, Curvature, Point, as_vector
-from .solver.linear import Vector, matvec, rmatvec
+from .solver.convex import ConvexProgram, Point, as_vector
+from .solver.linear import Vector, matvec, rmatvec, vector_norm
 from .solver.stages import stage
 from .status import Status
 from .verdict import unfold
 
-__all__ = ["Answer", "answer", "criterion_value"]
-
-PROVEN_LIMIT = 1e7  # loads; the checker asks for a tenth of it
+__all__ = ["Answer", "answer"]
 
 
 class Answer(NamedTuple):
@@ -65,179 +63,6 @@ def _shortfall(program: ConvexProgram, u: Cone) -> Array:
     return jnp.maximum(worst, jnp.zeros_like(worst)) / jnp.where(largest > 0, largest, jnp.ones_like(largest))
 
 
-def _top(exists: Array, u: Cone) -> Array:
-    return cone_max(jnp.where(exists > 0, u[0], jnp.full_like(u[0], -jnp.inf)))
-
-
-def _logs(weight: Array, terms: tuple[Array, Array, Array], exists: Array, u: Cone, size: Array) -> Array:
-    """``weight * sum log det P`` of the forces ``size u``."""
-    on_normal, on_cone, constant = terms
-    one = jnp.ones_like(u[0])
-    head = jnp.where(exists > 0, size * u[0], one)
-    det = jnp.where(exists > 0, size * size * determinant(u), one)
-    return weight * cone_sum(exists * (on_normal * jnp.log(head) + on_cone * jnp.log(det) + constant))
-
-
-@stage
-def criterion_value(
-    program: ConvexProgram,
-    u: Cone,
-    size: Array,
-    weight: Array | None,
-    terms: tuple[Array, Array, Array] | None,
-) -> Array:
-    """The criterion at the forces ``size u``."""
-    if program.price is not None:
-        return size * cone_sum(program.price * u[0])
-    if program.curvature is not None:
-        return size * size * cone_sum(program.exists * inner(u, program.curvature.apply(u))) / 2
-    top = size * _top(program.exists, u)
-    if weight is None or terms is None:
-        return top
-    return top - _logs(weight, terms, program.exists, u, size)
-
-
-class Pull(NamedTuple):
-    """x = A^T y + E^T beta per cone, and ``y.w - |beta|.bound`` (L,)."""
-
-    x: Cone
-    gain: Array
-
-
-@stage
-def _pull(program: ConvexProgram, rows: Array) -> Pull:
-    m = program.rhs.shape[0]
-    gain = -program.rhs[0] * rows[0]
-    for i in range(1, m):
-        gain = gain - program.rhs[i] * rows[i]
-    if program.bound is not None:
-        for j in range(program.bound.shape[0]):
-            gain = gain - jnp.abs(rows[m + j]) * program.bound[j]
-    return Pull(rmatvec(program.columns, as_vector(rows)), gain)
-
-
-def _covered(short: Array, cap: Array | None, total: Array) -> Array:
-    """The part of ``short`` (k, L) that multipliers of sum ``total`` should cover: the dearest caps first."""
-    k = short.shape[0]
-    rows = []
-    for i in range(k):
-        before = jnp.zeros_like(total)
-        for j in range(k):
-            if j == i:
-                continue
-            if cap is None:
-                first = j < i
-                before = before + (short[j] if first else jnp.zeros_like(total))
-            else:
-                first = (cap[j] > cap[i]) | ((cap[j] == cap[i]) & (j < i))
-                before = before + jnp.where(first, short[j], jnp.zeros_like(total))
-        left = jnp.maximum(total - before, jnp.zeros_like(total))
-        rows.append(jnp.minimum(left, short[i]))
-    return jnp.stack(rows)
-
-
-@stage
-def _linear_bound(program: ConvexProgram, pull: Pull) -> Array:
-    """Dual value of prices and levels: the twist as it is, paying caps, or scaled to need none."""
-    exists, x = program.exists, pull.x
-    zero = jnp.zeros_like(exists)
-    short = exists * jnp.maximum(tail_norm(x) - x[0], zero)
-    if program.price is not None:
-        covered = jnp.minimum(short, program.price)
-        largest = cone_max(short)
-    else:
-        covered = _covered(short, program.cap, jnp.ones_like(short[0]))
-        largest = cone_sum(short)
-    needed = jnp.where(largest > 0, largest, jnp.ones_like(largest))
-    scaled = jnp.where(largest > 0, pull.gain / needed, jnp.zeros_like(largest))
-    over = short - covered
-    cap = jnp.full_like(over, jnp.inf) if program.cap is None else program.cap
-    paid = cone_sum(jnp.where(over > 0, over * cap, zero))
-    return jnp.maximum(jnp.maximum(scaled, pull.gain - paid), jnp.zeros_like(scaled))
-
-
-@stage
-def _quadratic_bound(program: ConvexProgram, pull: Pull, u: Cone) -> Array:
-    """Dual value with the tails' cost linearised at u, which convexity allows; s_0 minimised exactly in [0, cap]."""
-    curvature: Curvature | None = program.curvature
-    assert curvature is not None
-    exists = program.exists
-    pushed = curvature.apply(u)
-    x = (pull.x[0], *(a + b for a, b in zip(pull.x[1:], pushed[1:], strict=True)))
-    spent = inner(u, pushed) - u[0] * pushed[0]
-    rho = jnp.maximum(tail_norm(x) - x[0], jnp.zeros_like(x[0]))
-    flat = jnp.where(exists > 0, curvature.head, jnp.ones_like(exists))
-    best = rho / flat
-    if program.cap is not None:
-        best = jnp.minimum(best, program.cap)
-    return pull.gain + cone_sum(exists * (flat * best * best / 2 - rho * best - spent / 2))
-
-
-@stage
-def _barrier_bound(program: ConvexProgram, pull: Pull, u: Cone) -> Array:
-    """Dual value of the fixed barriers: ``sum phi - phi log phi + phi/2 log det z + psi - psi log psi + psi log p``.
-
-    Where u_0 is at its level, ``phi z_0 / det z = psi / p = level`` fixes z_0 and p; elsewhere p is that of the forces.
-    The level's multipliers, of sum 1, supply what z lacks, the dearest caps first; what is left is
-    worth most at the largest u_0.
-    """
-    exists, x = program.exists, pull.x
-    phi, psi = program.cone_floor, program.head_floor
-    assert phi is not None and psi is not None
-    zero, one = jnp.zeros_like(exists), jnp.ones_like(exists)
-    top = _top(exists, u)
-    level, leads = top + zero, exists * jnp.where(u[0] >= top, one, zero)
-    if program.cap is not None:
-        level = jnp.minimum(level, program.cap)
-    tail = tail_norm(x)
-    wanted = jnp.where(phi > 0, (phi + jnp.sqrt(phi * phi + (2 * level * tail) ** 2)) / (2 * level), tail)
-    needed = exists * jnp.maximum(wanted + psi / level - x[0], zero)
-    price = exists * psi / jnp.where((exists > 0) & (needed <= 0), u[0], level)
-    share = _covered(needed, program.cap, one[0])
-    paid, over = jnp.zeros_like(one[0]), zero
-    if program.cap is not None:
-        finite = jnp.isfinite(program.cap) & (exists > 0)
-        over = jnp.where(finite, needed - share, zero)
-        paid = cone_sum(over * jnp.where(finite, program.cap, zero))
-    spare = jnp.maximum(one[0] - cone_sum(share), zero[0]) / jnp.maximum(cone_sum(leads), one[0])
-    head = share + leads * spare + over + x[0]
-    # A contact without barrier only needs z in its cone.
-    price = jnp.where(phi > 0, price, exists * (head - tail))
-    head = head - price
-    z = (jnp.where(exists > 0, head, one), *(exists * v for v in x[1:]))
-    det = jnp.where(interior_distance(z) > 0, determinant(z), zero)
-    value = _conjugate(phi, det, 0.5) + _conjugate(psi, price, 1.0)
-    return pull.gain - paid + cone_sum(jnp.where(exists > 0, value, zero))
-
-
-def _conjugate(floor: Array, value: Array, power: float) -> Array:
-    one = jnp.ones_like(floor)
-    some = floor > 0
-    safe = jnp.where(some, floor, one)
-    log = jnp.where(value > 0, jnp.log(jnp.where(value > 0, value, one)), jnp.full_like(value, -jnp.inf))
-    return jnp.where(some, safe - safe * jnp.log(safe) + power * safe * log, jnp.zeros_like(floor))
-
-
-@stage
-def _shifted(
-    bound: Array, weight: Array, terms: tuple[Array, Array, Array], exists: Array, size: Array
-) -> Array:
-    """Back from forces u to forces ``size u`` under the logarithms."""
-    on_normal, on_cone, constant = terms
-    log = jnp.log(size)
-    return size * bound - weight * cone_sum(exists * ((on_normal + 2 * on_cone) * log + constant))
-
-
-@stage
-def _unit(v: Vector) -> Vector:
-    square = v[0] * v[0]
-    for x in v[1:]:
-        square = square + x * x
-    size = jnp.sqrt(square)
-    size = jnp.where((size > 0) & jnp.isfinite(size), size, jnp.ones_like(size))
-    return tuple(x / size for x in v)
-
-
 @stage
 def _statuses(
     smoothing: Array | None, valid: Array, off: Array, rest: Array, stop: Array, short: Array,
@@ -261,15 +86,32 @@ def _statuses(
 
 
 @stage
-def _off_proof(folded: Folded, twist: Vector, wrench: Vector, size: Array, limit: float) -> Array:
-    """As ``power_left`` for a twist of A itself."""
-    x = rmatvec(folded.columns, twist)
-    short = folded.exists * jnp.maximum(tail_norm(x) - x[0], jnp.zeros_like(x[0]))
-    power = twist[0] * wrench[0]
-    outer = wrench[0] * wrench[0]
-    for a, b in zip(twist[1:], wrench[1:], strict=True):
-        power, outer = power + a * b, outer + b * b
-    return power - limit * jnp.sqrt(outer) * cone_sum(short)
+def _power_left(
+    folded: Folded, program: ConvexProgram, twist: Vector, beta: Array | None, load: Load, limit: float
+) -> Array:
+    """Power of the load along ``twist`` less what forces up to ``limit`` loads and the torques can take up, on A.
+
+    Allows twice for the rounding the checker allows for, in its float64.
+    """
+    rounding = rounding_constant() * unit_roundoff("float64")
+    x, blur = rmatvec(folded.columns, twist), folded.norm * vector_norm(twist)
+    if beta is not None:
+        joints = tuple(c[program.rhs.shape[0] :] for c in program.columns)
+        x = tuple(a + b for a, b in zip(x, rmatvec(joints, as_vector(beta)), strict=True))
+        blur = blur + vector_norm(as_vector(beta))
+    short = program.exists * jnp.maximum(tail_norm(x) - x[0] + rounding * blur, jnp.zeros_like(x[0]))
+    outer = vector_norm(load.wrench)
+    most = jnp.broadcast_to(limit * outer, short.shape)
+    if program.cap is not None:
+        most = jnp.minimum(most, program.cap * load.size)
+    taken = cone_sum(short * most)
+    if beta is not None:
+        for j in range(beta.shape[0]):
+            taken = taken + jnp.abs(beta[j]) * program.bound[j] * load.size
+    power = twist[0] * load.wrench[0]
+    for a, b in zip(twist[1:], load.wrench[1:], strict=True):
+        power = power + a * b
+    return power - rounding * vector_norm(twist) * outer - taken
 
 
 def answer(
@@ -295,26 +137,21 @@ def answer(
     cost = criterion_value(program, u, load.size, weight, terms)
 
     rows = _all_rows(point)
-    pull = _pull(program, rows)
-    if program.curvature is not None:
-        bound = _by_square(_quadratic_bound(program, pull, u), load.size)
-    elif program.head_floor is None:
-        bound = _by(_linear_bound(program, pull), load.size)
-    else:
-        assert weight is not None and terms is not None
-        raw = _barrier_bound(program, pull, u)
-        bound = _shifted(raw, weight, terms, program.exists, load.size)
+    bound = dual_value(program, rows, u, load.size, weight, terms)
+    bound = jnp.where(jnp.isnan(bound), -jnp.inf, bound)
     scale = _scale(program, point, load.size)
+    blur = _blur(program, rows, u, load.size)
     short = _shortfall(program, u)
-    proof = power_left(program, ray, PROVEN_LIMIT)
-    off_proof = _off_proof(folded, load.twist, load.wrench, load.size, PROVEN_LIMIT)
+    limit = proven_limit(dtype)
+    escape = to_twist(projection, as_vector(ray[:m]))
+    proof = _power_left(folded, program, escape, None if program.bound is None else ray[m:], load, limit)
+    off_proof = _power_left(folded, program, load.twist, None, load, limit)
     fine = rounding_constant() * unit_roundoff(dtype)
     status = _statuses(
-        program.smoothing, problem.valid, load.off, load.rest & (weight is None), stop, short, cost, bound, scale,
-        tolerance, proof, off_proof, fine,
+        program.smoothing, problem.valid, load.off, load.rest & (weight is None), stop, short, cost, bound - blur,
+        scale, tolerance, proof, off_proof, fine,
     )  # fmt: skip
 
-    escape = to_twist(projection, as_vector(ray[:m]))
     multiplier = to_twist(projection, as_vector(rows[:m]))
     load = load._replace(rest=load.rest & (weight is None))
     return _read_back(
@@ -329,13 +166,12 @@ def _all_rows(point: Point) -> Array:
 
 
 @stage
-def _by(x: Array, size: Array) -> Array:
-    return x * size
-
-
-@stage
-def _by_square(x: Array, size: Array) -> Array:
-    return x * size * size
+def _blur(program: ConvexProgram, rows: Array, u: Cone, size: Array) -> Array:
+    """What rounding can do to the bound of multipliers as large as ``rows``."""
+    forces = jnp.sqrt(cone_sum(program.exists * inner(u, u)))
+    blur = vector_norm(as_vector(rows)) * (vector_norm(as_vector(program.rhs)) + forces) * size
+    blur = jnp.asarray(8 * unit_roundoff(blur.dtype), blur.dtype) * blur
+    return blur * size if program.curvature is not None else blur
 
 
 @stage
@@ -373,7 +209,8 @@ def _read_back(
         off = load.off
         escape = tuple(jnp.where(off, a, b) for a, b in zip(load.twist, escape, strict=True))
         escape = tuple(x if i < dimension else x / length for i, x in enumerate(escape))
-        size = _size_of(escape)
+        size = vector_norm(escape)
+        size = jnp.where((size > 0) & jnp.isfinite(size), size, jnp.ones_like(size))
         escape = jnp.stack([final(jnp.where(infeasible, x / size, zero), zero, zero > 1) for x in escape])
         back = load.size if squared else jnp.ones_like(load.size)
         multiplier = [back * (x if i < dimension else x / length) for i, x in enumerate(multiplier)]
@@ -389,11 +226,3 @@ def _read_back(
         to_lanes(contacts.friction), to_lanes(contacts.torsion),
     )  # fmt: skip
     return Answer(status, *values)
-
-
-def _size_of(v: Vector) -> Array:
-    square = v[0] * v[0]
-    for x in v[1:]:
-        square = square + x * x
-    size = jnp.sqrt(square)
-    return jnp.where((size > 0) & jnp.isfinite(size), size, jnp.ones_like(size))

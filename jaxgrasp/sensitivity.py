@@ -24,9 +24,10 @@ from ._types import Array
 from .balance import Demand, balance, cone_program
 from .cones import Cone, cone_sum
 from .contacts import Component
+from .duality import criterion_value
 from .lanes import to_lanes, to_rows
 from .margin import Contacts, fold, project
-from .optimum import Answer, criterion_value
+from .optimum import Answer
 from .solver import Stop
 from .solver.convex import ConvexProgram, Point, as_vector
 from .solver.implicit import lagrangian, point_tangent, residuals

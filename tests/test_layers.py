@@ -20,8 +20,11 @@ FLOORS = [
     # the grasp
     "grasp",
     "criteria",
+    "lmi_problem",
     "barrier",
+    "semidefinite",
     "lmi",
+    "lmi_forces",
     # the solver: has never heard of grasping
     "solver.stages",
     "solver.linear",
@@ -31,6 +34,7 @@ FLOORS = [
     "solver.blocks",
     "solver.kkt",
     "solver.steps",
+    "solver.newton",
     "solver.primal_dual",
     "solver.implicit",
     "solver",
@@ -49,6 +53,7 @@ FLOORS = [
     "margin_sensitivity",
     "resistance",
     "balance",
+    "duality",
     "optimum",
     "sensitivity",
     "forces",

@@ -62,6 +62,12 @@ class Frame(NamedTuple):
         factors: list = [self.along, self.against, *([self.across] * (len(x) - 2))]
         return tuple(f * a for f, a in zip(factors[: len(x)], x, strict=True))
 
+    def head_of_unscaled(self, x: Cone) -> Array:
+        """The head of ``W^-1 x``, x in frame coordinates."""
+        if self.against is None:
+            return x[0] / self.along
+        return (x[0] / self.along + x[1] / self.against) * jnp.asarray(HALF, x[0].dtype)
+
     def head(self, value: Array) -> Cone:
         """``W (value, 0, ..)`` in frame coordinates; zeros across."""
         if self.against is None:

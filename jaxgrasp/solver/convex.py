@@ -65,6 +65,14 @@ class Bounds(NamedTuple):
             total = total + self.cap
         return total if self.head is None else total - self.head
 
+    def sum_on_head(self) -> Optional:
+        """level + cap + head, of rates: how prices on u_0 answer to u_0; None where there are none."""
+        present = [x for x in (self.level, self.cap, self.head) if x is not None]
+        total = present[0] if present else None
+        for x in present[1:]:
+            total = total + x
+        return total
+
 
 class Point(NamedTuple):
     """A primal-dual point strictly inside every inequality; y (m, L), xi (L,), u and z d arrays (k, L)."""

@@ -6,8 +6,10 @@ With p = W^-1 du in frame coordinates, the rows R = (B; E), the rates delta = pr
     R W p - (0; dr_E / rate) = rows
     sum_i delta_i (dxi - du_0,i) = level
 
-Eliminating p leaves a positive definite system in dr with the columns ``C = R W L^-T``, K = L L^T. The level xi borders
-the blocks as the shaft of an arrow and adds one column to C; the two-sided rows add a diagonal.
+Eliminating p leaves a positive definite system ``S S^T dr = ..`` with the columns ``C = R W L^-T``, K = L L^T, in S.
+The level xi borders the blocks as the shaft of an arrow and adds one column to C; the two-sided rows add a diagonal.
+S S^T is never formed: near a degenerate optimum its condition number is that of S squared, 1 / gap^2, and half of the
+digits of the step would be lost. ``S = T Q`` with orthonormal rows of Q gives p by a projection and dr by ``T^-T``.
 """
 
 from __future__ import annotations
@@ -15,13 +17,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jax import lax
 
-from .._types import Array, pivot_tolerance
+from .._types import Array, unit_roundoff
 from ..cones import Cone, cone_sum, inner
 from .blocks import Blocks, Frame, factor_blocks
 from .convex import Bounds, ConvexProgram, Optional, as_vector
-from .linear import Cholesky, cholesky, gram, matvec, rmatvec
-from .linear import solve as solve_factored
+from .linear import Cholesky, Vector, matvec, orthonormal_rows, rmatvec, solve_lower, solve_transposed
 from .stages import stage
 
 __all__ = ["KKT", "Direction", "factor"]
@@ -36,51 +38,50 @@ class Direction(NamedTuple):
 
 
 class Shaft(NamedTuple):
-    """The level's share: ``L^-1 W e_0 delta``, C times that, and the pivot of xi."""
+    """The level's share: ``L^-1 W e_0 delta``, and 1 over the root of the pivot of xi."""
 
     part: Cone
-    column: Array
-    pivot: Array
+    root: Array
 
 
 class KKT(NamedTuple):
     """A factored Newton system."""
 
     blocks: Blocks
-    columns: Cone  # C, d arrays (m + q, k, L)
-    cholesky: Cholesky
+    basis: Cone  # Q: d arrays (m + q, k, L), then the shaft's (m + q, 1, L)
+    triangle: Cholesky  # T
     shaft: Shaft | None
 
     def solve(self, h: Cone, head: Array, level: Optional, rows: Array) -> Direction:
         """h in frame coordinates (k, L), head (k, L), level (L,), rows (m + q, L)."""
-        start, target, along = _reduced(self.blocks, self.columns, self.shaft, h, head, level, rows)
-        multipliers = solve_factored(self.cholesky, as_vector(target))
-        return _expanded(self.blocks, self.columns, self.shaft, start, along, multipliers)
+        pushed, _ = solve_lower(self.triangle, as_vector(rows))
+        start, inside = _projected(self.blocks, self.basis, self.shaft, h, head, level, pushed)
+        multipliers = solve_transposed(self.triangle, inside)
+        return _expanded(self.blocks, self.basis, self.shaft, start, inside, multipliers)
 
 
 @stage
-def _reduced(
-    blocks: Blocks, columns: Cone, shaft: Shaft | None, h: Cone, head: Array, level: Optional, rows: Array
-) -> tuple[Cone, Array, Optional]:
+def _projected(
+    blocks: Blocks, basis: Cone, shaft: Shaft | None, h: Cone, head: Array, level: Optional, pushed: Vector
+) -> tuple[Cone, Vector]:
+    """``start``, the solution without equations, and what the rows of Q take from it."""
     start = tuple(a - b for a, b in zip(blocks.solve_lower(h), blocks.solve_head(head), strict=True))
-    target = matvec(columns, start) - rows
-    if shaft is None:
-        return start, target, None
-    along = level + cone_sum(inner(shaft.part, start))
-    return start, target + shaft.column * (along / shaft.pivot), along
+    if shaft is not None:
+        along = level + cone_sum(inner(shaft.part, start))
+        start = (*start, (along * shaft.root)[None])
+    taken = matvec(basis[: len(start)], start)
+    return start, tuple(taken[i] - x for i, x in enumerate(pushed))
 
 
 @stage
 def _expanded(
-    blocks: Blocks, columns: Cone, shaft: Shaft | None, start: Cone, along: Optional, multipliers
+    blocks: Blocks, basis: Cone, shaft: Shaft | None, start: Cone, inside: Vector, multipliers: Vector
 ) -> Direction:
-    p = tuple(a - b for a, b in zip(start, rmatvec(columns, multipliers), strict=True))
+    p = tuple(a - b for a, b in zip(start, rmatvec(basis[: len(start)], inside), strict=True))
     xi = None
     if shaft is not None:
-        for i, value in enumerate(multipliers):
-            along = along - shaft.column[i] * value
-        xi = along / shaft.pivot
-        p = tuple(a + b * xi for a, b in zip(p, shaft.part, strict=True))
+        xi = p[-1][0] * shaft.root
+        p = tuple(a + b * xi for a, b in zip(p[:-1], shaft.part, strict=True))
     return Direction(blocks.solve_upper(p), xi, jnp.stack(multipliers))
 
 
@@ -91,24 +92,35 @@ def _scaled_columns(blocks: Blocks, columns: Cone) -> Cone:
 
 
 @stage
-def _shaft_part(blocks: Blocks, level: Array) -> tuple[Cone, Array]:
+def _shaft(blocks: Blocks, level: Array) -> Shaft:
     assert blocks.head is not None
-    return blocks.solve_head(level), cone_sum(level / (1 + level * blocks.head))
+    return Shaft(blocks.solve_head(level), lax.rsqrt(cone_sum(level / (1 + level * blocks.head))))
 
 
 @stage
-def _shaft_column(columns: Cone, part: Cone, pivot: Array) -> tuple[Array, Array]:
-    column = matvec(columns, part)
-    return column, (column / jnp.sqrt(pivot))[:, None]
+def _shaft_column(columns: Cone, shaft: Shaft) -> Array:
+    return (matvec(columns, shaft.part) * shaft.root)[:, None]
 
 
 @stage
-def _with_diagonal(matrix: list[Array], rates: Array) -> list[Array]:
-    first = len(matrix) - rates.shape[0]
-    return [
-        column if j < first else jnp.concatenate([(column[0] + 1 / rates[j - first])[None], column[1:]])
-        for j, column in enumerate(matrix)
-    ]
+def _diagonal(rates: Array, rhs: Array) -> Array:
+    """(m + q, q, L): 0 over the roots of 1 / rate."""
+    root = lax.rsqrt(rates)
+    rows = [jnp.zeros((rhs.shape[0], *rates.shape), rates.dtype)]
+    for j in range(rates.shape[0]):
+        rows.append(jnp.stack([root[i] if i == j else 0 * root[i] for i in range(rates.shape[0])])[None])
+    return jnp.concatenate(rows)
+
+
+@stage
+def _rounding(columns: Cone) -> Array:
+    """Rows of S no longer than this are rounding as a whole."""
+    largest = None
+    for c in columns:
+        size = jnp.max(jnp.max(jnp.abs(c), axis=0), axis=0)
+        largest = size if largest is None else jnp.maximum(largest, size)
+    assert largest is not None
+    return jnp.asarray(4 * unit_roundoff(largest.dtype), largest.dtype) * largest
 
 
 @stage
@@ -125,10 +137,9 @@ def factor(program: ConvexProgram, frame: Frame, rates: Bounds) -> KKT:
     columns = _scaled_columns(blocks, program.columns)
     shaft, wide = None, columns
     if rates.level is not None:
-        part, pivot = _shaft_part(blocks, rates.level)
-        column, extra = _shaft_column(columns, part, pivot)
-        shaft, wide = Shaft(part, column, pivot), (*columns, extra)
-    matrix = gram(wide)
+        shaft = _shaft(blocks, rates.level)
+        wide = (*wide, _shaft_column(columns, shaft))
     if rates.upper is not None and rates.lower is not None:
-        matrix = _with_diagonal(list(matrix), rates.upper + rates.lower)
-    return KKT(blocks, columns, cholesky(tuple(matrix), pivot_tolerance(program.exists.dtype)), shaft)
+        wide = (*wide, _diagonal(rates.upper + rates.lower, program.rhs))
+    basis, triangle = orthonormal_rows(wide, _rounding(wide))
+    return KKT(blocks, basis, triangle, shaft)

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 from jax import lax
 
 from .._types import Array
-from ..cones import Cone, cone_sum, inner
+from ..cones import Cone, cone_sum
 from .stages import stage
 
-__all__ = ["Cholesky", "cholesky", "gram", "inverse_frobenius", "matvec", "rmatvec"]
+__all__ = ["Cholesky", "cholesky", "gram", "inverse_frobenius", "matvec", "vector_norm", "rmatvec"]
 
 Vector = tuple[Array, ...]  # m entries of shape (L,)
 
@@ -171,9 +171,14 @@ def _gram_column(columns: Cone, j: int) -> Array:
     return products(columns)
 
 
+def _overlap(x: Cone, y: Cone) -> Array:
+    """``x.y``; the arrays may be of different heights."""
+    return cone_sum(jnp.concatenate([a * b for a, b in zip(x, y, strict=True)]))
+
+
 @stage
 def _row_norm(row: Cone, floor: Array) -> tuple[Array, Array]:
-    square = cone_sum(inner(row, row))
+    square = _overlap(row, row)
     norm = jnp.sqrt(square)
     kept = norm > floor
     zero, one = jnp.zeros_like(norm), jnp.ones_like(norm)
@@ -198,7 +203,7 @@ def _row_products(row: Cone, below: Cone) -> Array:
 
 @stage
 def _cleared(rows: list[Cone], head: Cone) -> Cone:
-    overlaps = [cone_sum(inner(row, head)) for row in rows]
+    overlaps = [_overlap(row, head) for row in rows]
     for row, overlap in zip(rows, overlaps, strict=True):
         head = tuple(x - overlap * q for x, q in zip(head, row, strict=True))
     return head
@@ -241,6 +246,14 @@ def orthonormal_rows(columns: Cone, floor: Array) -> tuple[Cone, Cholesky]:
 @stage
 def _stacked(rows: list[Cone]) -> Cone:
     return tuple(jnp.stack(parts) for parts in zip(*rows, strict=True))
+
+
+def vector_norm(v: Vector) -> Array:
+    """``|v|`` (L,)."""
+    total = v[0] * v[0]
+    for x in v[1:]:
+        total = total + x * x
+    return jnp.sqrt(total)
 
 
 def matvec(columns: Cone, x: Cone) -> Array:
