@@ -360,7 +360,8 @@ measured = np.gradient(np.asarray(weak.cost), limit)
 inner = active & np.roll(active, 1) & np.roll(active, -1)
 inner[[0, -1]] = False
 print(f"the limit is active up to {limit[active].max():.2f} N m, where the torques reach it:")
-print("  largest torque / limit there:", torque.max(axis=-1)[active].min() / limit[active][-1])
+used = torque.max(axis=-1)[active] / limit[active]
+print("  largest torque / limit there:", used.min(), "to", used.max())
 print(
     "  d cost / d limit, multipliers against differences:", float(rate[inner][0]), float(measured[inner][0])
 )

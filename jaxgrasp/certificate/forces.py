@@ -166,7 +166,7 @@ def check_forces(grasp, result, tolerance: float | None = None) -> np.ndarray:
             met
             & (np.abs(value - cost) <= room + fine * _logarithmic(known, name, s, weight, dimension))
             & (bound <= best + room + fine * power)
-            & (value - best <= allowed)
+            & (value - np.minimum(best, bound) <= allowed + room + fine * power)
         )
 
         # The twist: more work than any admissible forces can take up.
