@@ -26,7 +26,7 @@ from .lanes import batched, in_chunks, map_selected, map_tiles, tile_width, to_l
 from .margin import Contacts, fold, project
 from .optimum import Answer, answer
 from .resistance import contacts_of
-from .sensitivity import Rows, Solved, differentiable
+from .sensitivity import Rows, Scales, Solved, differentiable
 from .solver import Stop
 from .solver.primal_dual import State, begin, solve
 from .solver.stages import kernel
@@ -124,9 +124,9 @@ def _iterate_kernel(plan: _Plan) -> Callable[..., State]:
     return run
 
 
-def _answer_kernel(plan: _Plan) -> Callable[..., Answer]:
+def _answer_kernel(plan: _Plan) -> Callable[..., tuple[Answer, Scales | None]]:
     @kernel
-    def run(rows: Rows, state: State, tolerance: Array) -> Answer:
+    def run(rows: Rows, state: State, tolerance: Array) -> tuple[Answer, Scales | None]:
         contacts, demand = rows
         folded, projection, problem = _problem(plan, rows)
         state = _to_lanes(state)
@@ -134,7 +134,8 @@ def _answer_kernel(plan: _Plan) -> Callable[..., Answer]:
             contacts, folded, projection, problem, demand, state.point, state.ray, state.stop, 4 * tolerance,
             plan.components, plan.dimension,
         )  # fmt: skip
-        return _to_rows(result)
+        scales = Scales(folded.length, problem.load.size, projection.factor, problem.row_norm)
+        return _to_rows((result, scales if plan.with_point else None))
 
     return run
 
@@ -156,11 +157,11 @@ def _solve_rows(plan: _Plan, rows: Rows, count: Array, tolerance: Array) -> Solv
     state = sweep(state, FIRST_BUDGET)
     state = sweep(state, TOTAL_BUDGET - FIRST_BUDGET)
 
-    def read(tile: tuple[Rows, State]) -> Answer:
+    def read(tile: tuple[Rows, State]) -> tuple[Answer, Scales | None]:
         return _answer_kernel(plan)(*tile, tolerance)
 
-    answers = map_tiles(read, (rows, state), count, width)
-    return Solved(answers, state.iterations, state.stop, state.point if plan.with_point else None)
+    answers, scales = map_tiles(read, (rows, state), count, width)
+    return Solved(answers, state.iterations, state.stop, state.point if plan.with_point else None, scales)
 
 
 @functools.cache

@@ -4,9 +4,8 @@
     d force = one solve with the Newton matrix at the solution                   (implicit function theorem)
 
 A ``custom_jvp`` whose rule calls the same function again, so gradients, Hessians and every nesting are exact. The
-load's size, the length L and the factor of A only scale the problem; the rule holds them
-fixed. Lanes without an optimum, and
-lanes without a load, have derivative 0.
+load's size, the length L and the factor of A only scale the problem; the rule holds them fixed. Lanes without an
+optimum, and lanes without a load, have derivative 0.
 """
 
 from __future__ import annotations
@@ -42,15 +41,6 @@ __all__ = ["Solved", "differentiable"]
 Rows = tuple[Contacts, Demand]
 
 
-class Solved(NamedTuple):
-    """The solver's part of a result, as rows; ``point`` only where derivatives may be wanted."""
-
-    answer: Answer
-    iterations: Array
-    stop: Array
-    point: Point | None
-
-
 class Scales(NamedTuple):
     """What the scaled problem was divided by: constants of the derivative. Lanes last."""
 
@@ -58,6 +48,16 @@ class Scales(NamedTuple):
     size: Array
     factor: Cholesky
     row_norm: Array | None
+
+
+class Solved(NamedTuple):
+    """The solver's part of a result, as rows; ``point`` and ``scales`` only where derivatives may be wanted."""
+
+    answer: Answer
+    iterations: Array
+    stop: Array
+    point: Point | None
+    scales: Scales | None
 
 
 def _scales(rows: Rows, components: tuple[Component, ...], dimension: int) -> Scales:
@@ -199,13 +199,16 @@ def _tangents(
     data = jax.tree.map(flat, rows)
     changes = jax.tree.map(flat, change)
     answer = jax.tree.map(flat, result.answer)
-    assert result.point is not None
-    stop, point = flat(result.stop), jax.tree.map(lambda x: to_lanes(flat(x)), result.point)
+    assert result.point is not None and result.scales is not None
+    stop = flat(result.stop)
+    point, given = jax.tree.map(lambda x: to_lanes(flat(x)), (result.point, result.scales))
     ok = (answer.status == Status.OPTIMAL.value) & (stop != Stop.SKIPPED.value)
 
     data = _safe(ok, data)
     changes = jax.tree.map(lambda x, dx: masked(ok, x, dx), data, changes)
     point = _safe_point(ok, point)
+    # The cost needs the solver's own scales only, so that a gradient of costs alone computes nothing twice.
+    given = jax.tree.map(lambda x: lax.stop_gradient(jnp.where(ok, x, jnp.ones_like(x))), given)
     scales = _scales(data, components, dimension)
 
     program = _program(data, scales, components, dimension)
@@ -217,7 +220,7 @@ def _tangents(
         lambda r, p: _view(r, scales, p, components, dimension), (data, point), (changes, moved)
     )
     if data[1].smoothing is None:
-        _, cost = jax.jvp(lambda r: _value(r, scales, point, components, dimension), (data,), (changes,))
+        _, cost = jax.jvp(lambda r: _value(r, given, point, components, dimension), (data,), (changes,))
     else:
         cost = seen.cost
 

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from .._types import Array, unit_roundoff, widest_scaling
+from .._types import Array, pivot_tolerance, unit_roundoff, widest_scaling
 from ..cones import Cone, cone_sum, inner
 from .blocks import Frame, tail_basis, unit_direction
 from .convex import Bounds, ConvexProgram, Optional, Point
@@ -140,7 +140,9 @@ def _system(program: ConvexProgram, point: Point) -> _System:
     cut = [None if w is None else jnp.minimum(w, limit) for w in (frame.along, frame.against, frame.across)]
     assert cut[0] is not None
     frame = Frame(frame.basis, cut[0], cut[1], cut[2])
-    return _System(program, masks, rates, frame, stiffness, factor(program, frame, rates))
+    # Rows closer to dependent than this make derivatives of rounding: a degenerate optimum gets one finite choice.
+    dependent = pivot_tolerance(program.exists.dtype) ** 0.5
+    return _System(program, masks, rates, frame, stiffness, factor(program, frame, rates, dependent))
 
 
 class _Sources(NamedTuple):

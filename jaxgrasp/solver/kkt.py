@@ -131,8 +131,20 @@ def _blocks(frame: Frame, program: ConvexProgram, rates: Bounds) -> Blocks:
     return factor_blocks(frame, head, program.curvature, rates.level)
 
 
-def factor(program: ConvexProgram, frame: Frame, rates: Bounds) -> KKT:
-    """Factor the Newton system for the scaling ``frame`` and the ``rates`` price / slack of the inequalities."""
+@stage
+def _shares(columns: Cone, share: float) -> Vector:
+    """``share`` of the length of each row."""
+    return tuple(
+        share * jnp.sqrt(cone_sum(jnp.concatenate([c[i] * c[i] for c in columns])))
+        for i in range(columns[0].shape[0])
+    )
+
+
+def factor(program: ConvexProgram, frame: Frame, rates: Bounds, dependent: float | None = None) -> KKT:
+    """Factor the Newton system for the scaling ``frame`` and the ``rates`` price / slack of the inequalities.
+
+    A row of S counts as dependent where what is left of it is rounding, or this share of it.
+    """
     blocks = _blocks(frame, program, rates)
     columns = _scaled_columns(blocks, program.columns)
     shaft, wide = None, columns
@@ -141,5 +153,6 @@ def factor(program: ConvexProgram, frame: Frame, rates: Bounds) -> KKT:
         wide = (*wide, _shaft_column(columns, shaft))
     if rates.upper is not None and rates.lower is not None:
         wide = (*wide, _diagonal(rates.upper + rates.lower, program.rhs))
-    basis, triangle = orthonormal_rows(wide, _rounding(wide))
+    floor = _rounding(wide) if dependent is None else _shares(wide, dependent)
+    basis, triangle = orthonormal_rows(wide, floor)
     return KKT(blocks, basis, triangle, shaft)

@@ -214,13 +214,15 @@ def _row_removed(row: Cone, below: Cone, products: Array) -> Cone:
     return tuple(rest - products[:, None] * x[None] for x, rest in zip(row, below, strict=True))
 
 
-def orthonormal_rows(columns: Cone, floor: Array) -> tuple[Cone, Cholesky]:
+def orthonormal_rows(columns: Cone, floor: Array | Vector) -> tuple[Cone, Cholesky]:
     """``A = L Q`` with orthonormal rows of Q, by modified Gram-Schmidt, for A given as d arrays (m, k, L).
 
-    A row whose remainder is not longer than ``floor`` depends on those above it and becomes zero. Each remainder is
-    cleared of the rows above once more: twice is enough (Kahan, Parlett) for orthogonality to rounding.
+    A row whose remainder is not longer than ``floor`` (one for all, or one a row) depends on those above it and becomes
+    zero. Each remainder is cleared of the rows above once more: twice is enough (Kahan, Parlett) for orthogonality to
+    rounding.
     """
     m = columns[0].shape[0]
+    floors = floor if isinstance(floor, tuple) else (floor,) * m
     rest: Cone = columns
     rows: list[Cone] = []
     lower: list[Array] = []
@@ -229,7 +231,7 @@ def orthonormal_rows(columns: Cone, floor: Array) -> tuple[Cone, Cholesky]:
         head: Cone = tuple(c[0] for c in rest)
         if rows:
             head = _cleared(rows, head)
-        norm, reciprocal = _row_norm(head, floor)
+        norm, reciprocal = _row_norm(head, floors[i])
         row = _row_scaled(head, reciprocal)
         below = tuple(c[1:] for c in rest)
         if i < m - 1:
