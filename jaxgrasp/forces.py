@@ -22,7 +22,7 @@ from .contacts import Component
 from .criteria import Criterion, Gentlest
 from .geometry import wrench_dimension
 from .grasp import Grasp
-from .lanes import batched, in_chunks, map_selected, map_tiles, tile_width, to_lanes, to_rows
+from .lanes import batched, in_chunks, in_sweeps, tile_width, to_lanes, to_rows
 from .margin import Contacts, fold, project
 from .optimum import Answer, answer
 from .resistance import contacts_of
@@ -100,68 +100,72 @@ def _problem(plan: _Plan, rows: Rows):
     return folded, projection, balance(contacts, folded, projection, demand, plan.components, plan.dimension)
 
 
-def _setup_kernel(plan: _Plan) -> Callable[[Rows], State]:
+class _Progress(NamedTuple):
+    """What a sweep over the tiles leaves behind, as rows; ``scales`` only where derivatives may be wanted."""
+
+    state: State
+    answer: Answer
+    scales: Scales | None
+
+
+def _tile_kernel(plan: _Plan) -> Callable[..., _Progress]:
+    """A tile's whole way. One kernel for first steps and stragglers alike: it is what takes long to compile."""
+
     @kernel
-    def run(rows: Rows) -> State:
-        folded, projection, problem = _problem(plan, rows)
-        load = problem.load
-        idle = load.rest if rows[1].criterion.barrier_weight is None else jnp.zeros_like(load.rest)
-        point = starting_point(problem, projection, folded.count)
-        return _to_rows(begin(problem.program, point, ~problem.valid | load.off | idle))
-
-    return run
-
-
-def _iterate_kernel(plan: _Plan) -> Callable[..., State]:
-    @kernel
-    def run(rows: Rows, state: State, budget: Array, tolerance: Array) -> State:
-        *_, problem = _problem(plan, rows)
-        fine = 8 * unit_roundoff(tolerance.dtype)
-        if rows[1].criterion.barrier_weight is not None:
-            tolerance = tolerance / 10  # the bound is read off the forces, which doubles what they lack
-        return _to_rows(solve(problem.program, _to_lanes(state), tolerance, proves, budget, fine))
-
-    return run
-
-
-def _answer_kernel(plan: _Plan) -> Callable[..., tuple[Answer, Scales | None]]:
-    @kernel
-    def run(rows: Rows, state: State, tolerance: Array) -> tuple[Answer, Scales | None]:
+    def run(rows: Rows, state: State, fresh: Array, budget: Array, tolerance: Array) -> _Progress:
         contacts, demand = rows
         folded, projection, problem = _problem(plan, rows)
-        state = _to_lanes(state)
+        load = problem.load
+        weighted = demand.criterion.barrier_weight is not None
+        idle = jnp.zeros_like(load.rest) if weighted else load.rest
+        point = starting_point(problem, projection, folded.count)
+        start = begin(problem.program, point, ~problem.valid | load.off | idle)
+        state = jax.tree.map(lambda new, old: jnp.where(fresh, new, old), start, _to_lanes(state))
+        # A robust bound is read off the forces, which doubles what they lack.
+        goal = tolerance / 10 if weighted else tolerance
+        fine = 8 * unit_roundoff(tolerance.dtype)
+        state = solve(problem.program, state, goal, proves, budget, fine)
         result = answer(
             contacts, folded, projection, problem, demand, state.point, state.ray, state.stop, 4 * tolerance,
             plan.components, plan.dimension,
         )  # fmt: skip
-        scales = Scales(folded.length, problem.load.size, projection.factor, problem.row_norm)
-        return _to_rows((result, scales if plan.with_point else None))
+        scales = Scales(folded.length, load.size, projection.factor, problem.row_norm)
+        return _to_rows(_Progress(state, result, scales if plan.with_point else None))
 
     return run
 
 
 def _solve_rows(plan: _Plan, rows: Rows, count: Array, tolerance: Array) -> Solved:
     """All sweeps over the first ``count`` of (N, ..) rows; N is a multiple of the tile width."""
-    n, width = rows[0].active.shape[0], plan.width
-    state = map_tiles(_setup_kernel(plan), rows, count, width)
-    iterate = _iterate_kernel(plan)
+    run = _tile_kernel(plan)
 
-    def sweep(state: State, steps: int) -> State:
-        def run(tile: tuple[Rows, State]) -> State:
-            return iterate(*tile, jnp.int32(steps), tolerance)
+    def advance(rows: Rows, progress: _Progress, sweep: Array) -> _Progress:
+        fresh = sweep == 0
+        budget = jnp.where(fresh, jnp.int32(FIRST_BUDGET), jnp.int32(TOTAL_BUDGET - FIRST_BUDGET))
+        return run(rows, progress.state, fresh, budget, tolerance)
 
-        live = jnp.arange(n, dtype=jnp.int32) < count
-        running = (state.stop == Stop.RUNNING.value) & live
-        return map_selected(run, running, (rows, state), state, width)
+    def unfinished(progress: _Progress) -> Array:
+        return progress.state.stop == Stop.RUNNING.value
 
-    state = sweep(state, FIRST_BUDGET)
-    state = sweep(state, TOTAL_BUDGET - FIRST_BUDGET)
-
-    def read(tile: tuple[Rows, State]) -> tuple[Answer, Scales | None]:
-        return _answer_kernel(plan)(*tile, tolerance)
-
-    answers, scales = map_tiles(read, (rows, state), count, width)
+    state, answers, scales = in_sweeps(advance, rows, _shapes(plan, rows), unfinished, count, 2, plan.width)
     return Solved(answers, state.iterations, state.stop, state.point if plan.with_point else None, scales)
+
+
+def _shapes(plan: _Plan, rows: Rows) -> _Progress:
+    """The shapes of what a tile leaves behind."""
+
+    def first(tile: Rows) -> _Progress:
+        folded, projection, problem = _problem(plan, tile)
+        point = starting_point(problem, projection, folded.count)
+        state = begin(problem.program, point, ~problem.valid)
+        result = answer(
+            *tile[:1], folded, projection, problem, tile[1], state.point, state.ray, state.stop,
+            problem.load.size, plan.components, plan.dimension,
+        )  # fmt: skip
+        scales = Scales(folded.length, problem.load.size, projection.factor, problem.row_norm)
+        return _to_rows(_Progress(state, result, scales if plan.with_point else None))
+
+    return jax.eval_shape(first, rows)
 
 
 @functools.cache

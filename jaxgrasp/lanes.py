@@ -124,6 +124,75 @@ def map_selected(kernel: Callable[[Any], Any], selected: Array, rows: Any, out: 
     return lax.while_loop(pending, one_tile, (jnp.int32(0), out))[1]
 
 
+class Packing:
+    """A pytree of rows as one matrix (N, F) for each dtype: rows are then gathered and written in one piece.
+
+    On the CPU a gather or scatter of rows costs about as much for one array as for another, whatever their width.
+    """
+
+    def __init__(self, like: Any):
+        leaves, self._structure = jax.tree.flatten(like)
+        self._shapes = [x.shape[1:] for x in leaves]
+        self._dtypes = [jnp.dtype(x.dtype).name for x in leaves]
+
+    def pack(self, tree: Any) -> dict[str, Array]:
+        groups: dict[str, list[Array]] = {}
+        for x, name in zip(jax.tree.leaves(tree), self._dtypes, strict=True):
+            groups.setdefault(name, []).append(x.reshape(x.shape[0], math.prod(x.shape[1:])))
+        return {name: jnp.concatenate(parts, axis=1) for name, parts in groups.items()}
+
+    def unpack(self, packed: dict[str, Array]) -> Any:
+        start = dict.fromkeys(packed, 0)
+        leaves = []
+        for shape, name in zip(self._shapes, self._dtypes, strict=True):
+            size, at = math.prod(shape), start[name]
+            block = packed[name][:, at : at + size]
+            leaves.append(block.reshape(block.shape[0], *shape))
+            start[name] = at + size
+        return jax.tree.unflatten(self._structure, leaves)
+
+
+def in_sweeps(
+    kernel: Callable[[Any, Any, Array], Any],
+    rows: Any,
+    like: Any,
+    unfinished: Callable[[Any], Array],
+    count: Array,
+    sweeps: int,
+    width: int,
+) -> Any:
+    """``out = kernel(rows, out, sweep)`` on the first ``count`` rows, then again on those still ``unfinished(out)``.
+
+    ``like`` gives the shapes of ``out``, which begins as zeros. Each sweep gathers its rows into full tiles, so the
+    cost follows their number. The kernel is compiled once.
+    """
+    n = _count(rows)
+    given, made = Packing(rows), Packing(like)
+    source = given.pack(rows)
+    shapes = jax.eval_shape(made.pack, like)
+    out = jax.tree.map(lambda s: jnp.zeros((n, *s.shape[1:]), s.dtype), shapes)
+    live = jnp.arange(n, dtype=jnp.int32) < count
+
+    def sweep(carry: tuple[Array, Any]) -> tuple[Array, Any]:
+        number, out = carry
+        selected = live & ((number == 0) | unfinished(made.unpack(out)))
+        index = jnp.nonzero(selected, size=n, fill_value=n)[0].astype(jnp.int32)
+        tiles = _tiles(jnp.sum(selected, dtype=jnp.int32), width)
+
+        def one_tile(carry: tuple[Array, Any]) -> tuple[Array, Any]:
+            tile, current = carry
+            chosen = lax.dynamic_slice(index, (tile * jnp.int32(width),), (width,))
+            here, before = jax.tree.map(lambda x: x.at[chosen].get(mode="clip"), (source, current))
+            result = made.pack(kernel(given.unpack(here), made.unpack(before), number))
+            updated = jax.tree.map(lambda x, r: x.at[chosen].set(r, mode="drop"), current, result)
+            return tile + jnp.int32(1), updated
+
+        return number + 1, lax.while_loop(lambda carry: carry[0] < tiles, one_tile, (jnp.int32(0), out))[1]
+
+    out = lax.while_loop(lambda carry: carry[0] < sweeps, sweep, (jnp.int32(0), out))[1]
+    return made.unpack(out)
+
+
 def in_chunks(solve: Callable[[Any, Array], Any], rows: Any, batch: tuple[int, ...], chunk: int) -> Any:
     """``solve(rows, count)`` on chunks of one shape, so that every batch size runs one executable; batch axes restored.
 

@@ -55,29 +55,52 @@ class KKT(NamedTuple):
     def solve(self, h: Cone, head: Array, level: Optional, rows: Array) -> Direction:
         """h in frame coordinates (k, L), head (k, L), level (L,), rows (m + q, L)."""
         pushed, _ = solve_lower(self.triangle, as_vector(rows))
-        start, inside = _projected(self.blocks, self.basis, self.shaft, h, head, level, pushed)
+        start = _without_equations(self.blocks, self.shaft, h, head, level)
+        inside = _taken(self.basis, start, pushed)
         multipliers = solve_transposed(self.triangle, inside)
-        return _expanded(self.blocks, self.basis, self.shaft, start, inside, multipliers)
+        p = _remaining(self.basis, start, inside)
+        return _expanded(self.blocks, self.shaft, p, multipliers)
+
+
+# Stages, so that nothing below is computed once for each of its readers.
 
 
 @stage
-def _projected(
-    blocks: Blocks, basis: Cone, shaft: Shaft | None, h: Cone, head: Array, level: Optional, pushed: Vector
-) -> tuple[Cone, Vector]:
-    """``start``, the solution without equations, and what the rows of Q take from it."""
-    start = tuple(a - b for a, b in zip(blocks.solve_lower(h), blocks.solve_head(head), strict=True))
-    if shaft is not None:
-        along = level + cone_sum(inner(shaft.part, start))
-        start = (*start, (along * shaft.root)[None])
-    taken = matvec(basis[: len(start)], start)
-    return start, tuple(taken[i] - x for i, x in enumerate(pushed))
+def _pushed_down(blocks: Blocks, h: Cone, head: Array) -> Cone:
+    return tuple(a - b for a, b in zip(blocks.solve_lower(h), blocks.solve_head(head), strict=True))
 
 
 @stage
-def _expanded(
-    blocks: Blocks, basis: Cone, shaft: Shaft | None, start: Cone, inside: Vector, multipliers: Vector
-) -> Direction:
-    p = tuple(a - b for a, b in zip(start, rmatvec(basis[: len(start)], inside), strict=True))
+def _along_shaft(shaft: Shaft, start: Cone, level: Array) -> Array:
+    return ((level + cone_sum(inner(shaft.part, start))) * shaft.root)[None]
+
+
+def _without_equations(blocks: Blocks, shaft: Shaft | None, h: Cone, head: Array, level: Optional) -> Cone:
+    """The solution without equations, in the coordinates of L and of the shaft."""
+    start = _pushed_down(blocks, h, head)
+    return start if shaft is None else (*start, _along_shaft(shaft, start, level))
+
+
+_product = stage(matvec)
+
+
+@stage
+def _difference(taken: Array, pushed: Vector) -> Vector:
+    return tuple(taken[i] - x for i, x in enumerate(pushed))
+
+
+def _taken(basis: Cone, start: Cone, pushed: Vector) -> Vector:
+    """What the rows of Q take from ``start``."""
+    return _difference(_product(basis[: len(start)], start), pushed)
+
+
+@stage
+def _remaining(basis: Cone, start: Cone, inside: Vector) -> Cone:
+    return tuple(a - b for a, b in zip(start, rmatvec(basis[: len(start)], inside), strict=True))
+
+
+@stage
+def _expanded(blocks: Blocks, shaft: Shaft | None, p: Cone, multipliers: Vector) -> Direction:
     xi = None
     if shaft is not None:
         xi = p[-1][0] * shaft.root

@@ -202,8 +202,12 @@ def _row_products(row: Cone, below: Cone) -> Array:
 
 
 @stage
-def _cleared(rows: list[Cone], head: Cone) -> Cone:
-    overlaps = [_overlap(row, head) for row in rows]
+def _overlaps(rows: list[Cone], head: Cone) -> Vector:
+    return tuple(_overlap(row, head) for row in rows)
+
+
+@stage
+def _without(rows: list[Cone], head: Cone, overlaps: Vector) -> Cone:
     for row, overlap in zip(rows, overlaps, strict=True):
         head = tuple(x - overlap * q for x, q in zip(head, row, strict=True))
     return head
@@ -230,7 +234,7 @@ def orthonormal_rows(columns: Cone, floor: Array | Vector) -> tuple[Cone, Choles
     for i in range(m):
         head: Cone = tuple(c[0] for c in rest)
         if rows:
-            head = _cleared(rows, head)
+            head = _without(rows, head, _overlaps(rows, head))
         norm, reciprocal = _row_norm(head, floors[i])
         row = _row_scaled(head, reciprocal)
         below = tuple(c[1:] for c in rest)

@@ -21,7 +21,7 @@ from .convex import Bounds, ConvexProgram, Optional, Point
 from .interior_point import nesterov_todd
 from .kkt import Direction, factor
 from .stages import stage
-from .steps import cone_reach, in_frame, reciprocal, rejoined
+from .steps import cone_reach, in_frame, rejoined
 
 __all__ = ["Step", "measure", "newton_step"]
 
@@ -185,8 +185,7 @@ def _completed(
 
 @stage
 def _reach(reach: Array, masks: Bounds, point: Point, step: Step) -> Array:
-    """The largest rate over all inequalities; the step to the boundary is 1 / rate, and at most 1."""
-    reach = jnp.maximum(reach, jnp.ones_like(reach))
+    """The largest rate over all inequalities; the step to the boundary is 1 / rate."""
     for mask, a, b, da, db in zip(masks, point.slack, point.price, step.slack, step.price, strict=True):
         if mask is not None:
             rate = jnp.maximum(-da / a, -db / b)
@@ -232,6 +231,7 @@ def _aim(
 
 @stage
 def _length(reach: Array, fraction: Array) -> Array:
+    """At most 1: a full step removes the residuals for good."""
     return 1 / jnp.maximum(jnp.ones_like(reach), reach / fraction)
 
 
@@ -256,7 +256,7 @@ def newton_step(
 
     zero, one = jnp.zeros_like(excess), jnp.ones_like(excess)
     affine, reach = direction(zero, one, one, one, None)
-    length = reciprocal(reach)
+    length = _length(reach, one)
     ahead = _moved(point, affine, length)
     after, count = measure(program, ahead.u, ahead.z, ahead.slack, ahead.price)
     # Far from a fixed barrier's floor the full second-order correction overshoots.

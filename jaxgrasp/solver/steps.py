@@ -9,7 +9,7 @@ from .._types import Array
 from ..cones import Cone, cone_max, determinant, inner, tail_inner
 from .stages import stage
 
-__all__ = ["cone_reach", "in_frame", "reciprocal", "rejoined"]
+__all__ = ["cone_reach", "in_frame", "rejoined"]
 
 
 def rejoined(x: Cone) -> Cone:
@@ -34,11 +34,6 @@ def _cone_rate(lam: Cone, direction: Cone) -> Array:
 @stage
 def cone_reach(exists: Array, lam: Cone, p: Cone, q: Cone) -> Array:
     return cone_max(exists * jnp.maximum(_cone_rate(lam, p), _cone_rate(lam, q)))
-
-
-@stage
-def reciprocal(x: Array) -> Array:
-    return 1 / x
 
 
 @stage
