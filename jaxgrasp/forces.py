@@ -17,17 +17,18 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from ._types import Array, Float, Int, gap_floor, unit_roundoff
-from .balance import Demand, balance, proves, starting_point
+from .balance import Balance, Demand, balance, proves, starting_point
 from .contacts import Component
 from .criteria import Criterion, Gentlest
 from .geometry import wrench_dimension
 from .grasp import Grasp
 from .lanes import batched, in_chunks, in_sweeps, tile_width, to_lanes, to_rows
-from .margin import Contacts, fold, project
+from .margin import Contacts, Folded, Projection, fold, project, to_twist
 from .optimum import Answer, answer
 from .resistance import contacts_of
 from .sensitivity import Rows, Scales, Solved, differentiable
 from .solver import Stop
+from .solver.convex import as_vector
 from .solver.primal_dual import State, begin, solve
 from .solver.stages import kernel
 
@@ -101,11 +102,15 @@ def _problem(plan: _Plan, rows: Rows):
 
 
 class _Progress(NamedTuple):
-    """What a sweep over the tiles leaves behind, as rows; ``scales`` only where derivatives may be wanted."""
+    """What a sweep over the tiles leaves behind, as rows; the last two only where derivatives may be wanted.
+
+    multipliers  (m,) of A itself, where those of the state belong to its orthonormal rows
+    """
 
     state: State
     answer: Answer
     scales: Scales | None
+    multipliers: Array | None
 
 
 def _tile_kernel(plan: _Plan) -> Callable[..., _Progress]:
@@ -129,10 +134,19 @@ def _tile_kernel(plan: _Plan) -> Callable[..., _Progress]:
             contacts, folded, projection, problem, demand, state.point, state.ray, state.stop, 4 * tolerance,
             plan.components, plan.dimension,
         )  # fmt: skip
-        scales = Scales(folded.length, load.size, projection.factor, problem.row_norm)
-        return _to_rows(_Progress(state, result, scales if plan.with_point else None))
+        return _to_rows(_progress(plan, state, result, folded, projection, problem))
 
     return run
+
+
+def _progress(
+    plan: _Plan, state: State, result: Answer, folded: Folded, projection: Projection, problem: Balance
+) -> _Progress:
+    if not plan.with_point:
+        return _Progress(state, result, None, None)
+    scales = Scales(folded.length, problem.load.size, projection.factor, problem.row_norm)
+    y = state.point.y
+    return _Progress(state, result, scales, jnp.stack(to_twist(projection, as_vector(y))))
 
 
 def _solve_rows(plan: _Plan, rows: Rows, count: Array, tolerance: Array) -> Solved:
@@ -147,8 +161,10 @@ def _solve_rows(plan: _Plan, rows: Rows, count: Array, tolerance: Array) -> Solv
     def unfinished(progress: _Progress) -> Array:
         return progress.state.stop == Stop.RUNNING.value
 
-    state, answers, scales = in_sweeps(advance, rows, _shapes(plan, rows), unfinished, count, 2, plan.width)
-    return Solved(answers, state.iterations, state.stop, state.point if plan.with_point else None, scales)
+    shapes = _shapes(plan, rows)
+    state, answers, scales, y = in_sweeps(advance, rows, shapes, unfinished, count, 2, plan.width)
+    point = None if y is None else state.point._replace(y=y)
+    return Solved(answers, state.iterations, state.stop, point, scales)
 
 
 def _shapes(plan: _Plan, rows: Rows) -> _Progress:
@@ -162,8 +178,7 @@ def _shapes(plan: _Plan, rows: Rows) -> _Progress:
             *tile[:1], folded, projection, problem, tile[1], state.point, state.ray, state.stop,
             problem.load.size, plan.components, plan.dimension,
         )  # fmt: skip
-        scales = Scales(folded.length, problem.load.size, projection.factor, problem.row_norm)
-        return _to_rows(_Progress(state, result, scales if plan.with_point else None))
+        return _to_rows(_progress(plan, state, result, folded, projection, problem))
 
     return jax.eval_shape(first, rows)
 
@@ -171,7 +186,7 @@ def _shapes(plan: _Plan, rows: Rows) -> _Progress:
 @functools.cache
 def _compiled(plan: _Plan) -> Callable[..., Solved]:
     solve = batched(functools.partial(_solve_rows, plan), lambda rows: rows[0].active.shape[:-1], plan.width)
-    return jax.jit(differentiable(solve, plan.components, plan.dimension))
+    return jax.jit(differentiable(solve, plan.components, plan.dimension, plan.width))
 
 
 _solve_chunk = jax.jit(_solve_rows, static_argnames=("plan",))

@@ -2,9 +2,10 @@
 
     d t* = derivative of the Lagrangian of the margin's cone program, the solution fixed    (envelope theorem)
 
-and of the internal force behind it, by the implicit function theorem. t* depends on Null(A) alone, so L and the factor
-of A, which scale the program, are held fixed. A ``custom_jvp`` whose rule calls the same function: it nests. Lanes
-without a margin (INVALID, t* = -inf), and all lanes of ``verdict_only``, have derivative 0.
+and of the internal force behind it, by the implicit function theorem. t* depends on Null(A) alone, so the length L,
+which scales the program, is held fixed; the factor of A serves the linear solve alone. A ``custom_jvp`` whose rule
+calls the same function: it nests. Lanes without a margin (INVALID, t* = -inf), and all lanes of ``verdict_only``, have
+derivative 0.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ from ._types import Array
 from .cones import Cone, cone_sum
 from .contacts import Component
 from .lanes import to_lanes, to_rows
-from .margin import Contacts, fold, margin_program, project
+from .margin import Contacts, fold, margin_program
 from .solver import Stop
 from .solver.convex import Bounds, ConvexProgram, Point
-from .solver.implicit import lagrangian, point_tangent, residuals
+from .solver.implicit import Motion, lagrangian, newton_solve, point_tangent, residuals
 from .solver.linear import Cholesky
-from .solver.stages import inlined
-from .tangents import in_row_basis, kept, masked, safe_contacts, zero_tangent
+from .solver.stages import inlined, kernel
+from .tangents import in_tiles, kept, masked, safe_contacts, zero_tangent
 from .verdict import Verdict, unfold
 
 __all__ = ["Solved", "differentiable"]
@@ -36,12 +37,16 @@ NO_BOUNDS = Bounds(None, None, None, None, None)
 
 
 class Solved(NamedTuple):
-    """The solver's part of a result, as rows; ``point`` is (y, u, z) of the margin's cone program."""
+    """The solver's part of a result, as rows.
+
+    point  (y, u, z) of the margin's cone program, y the multipliers of A itself; None where no derivative is wanted
+    """
 
     verdict: Verdict
     iterations: Array
     stop: Array
-    point: tuple[Array, Array, Array]
+    point: tuple[Array, Array, Array] | None
+    scales: Scales | None
 
 
 class Scales(NamedTuple):
@@ -51,18 +56,16 @@ class Scales(NamedTuple):
     factor: Cholesky
 
 
-def _scales(contacts: Contacts, components: tuple[Component, ...]) -> Scales:
-    folded = fold(lax.stop_gradient(contacts), components)
-    return lax.stop_gradient(Scales(folded.length, project(folded).factor))
+class _Form(NamedTuple):
+    """What is fixed at trace time."""
+
+    components: tuple[Component, ...]
+    width: int
 
 
-def _program(contacts: Contacts, scales: Scales, components: tuple[Component, ...]) -> ConvexProgram:
-    """``margin.margin_program`` as a differentiable function of the contacts."""
-    folded = fold(contacts, components, scales.length)
-    columns = in_row_basis(scales.factor, folded.columns)
-    m = columns[0].shape[0]
-    resultant = tuple(cone_sum(columns[0][i]) for i in range(m))
-    program = margin_program(folded._replace(columns=columns, resultant=resultant))
+def _program(form: _Form, contacts: Contacts, scales: Scales) -> ConvexProgram:
+    """``margin.margin_program`` of A itself as a differentiable function of the contacts."""
+    program = margin_program(fold(contacts, form.components, scales.length))
     none = (None,) * 7
     return ConvexProgram(program.columns, jnp.stack(program.rhs), program.exists, program.cost[0], *none)
 
@@ -75,13 +78,30 @@ def _internal_force(
     return unfold(s, components, to_lanes(contacts.friction), to_lanes(contacts.torsion))
 
 
+def _solver(form: _Form, contacts: Contacts, scales: Scales, point: Point) -> Callable[[Motion], Motion]:
+    """``newton_solve`` at these points, tile by tile; lanes last outside."""
+
+    @kernel
+    def run(contacts: Contacts, scales: Scales, point: Point, rhs: Motion) -> Motion:
+        scales, point, rhs = jax.tree.map(to_lanes, (scales, point, rhs))
+        program = _program(form, contacts, scales)
+        return jax.tree.map(to_rows, newton_solve(program, point, scales.factor, rhs))
+
+    solve = in_tiles(lambda tile: run(*tile), form.width)
+
+    def solved(rhs: Motion) -> Motion:
+        given = jax.tree.map(to_rows, (scales, point, rhs))
+        with inlined(False):
+            return jax.tree.map(to_lanes, solve((contacts, *given)))
+
+    return solved
+
+
 def differentiable(
-    solve: Callable[[Contacts, Array], Solved],
-    components: tuple[Component, ...],
-    dimension: int,
-    exact: bool,
+    solve: Callable[[Contacts, Array], Solved], components: tuple[Component, ...], exact: bool, width: int
 ) -> Callable[[Contacts, Array], Solved]:
     """``solve`` with derivatives of margin and internal force; ``exact``: the solver went to the optimum."""
+    form = _Form(components, width)
 
     @jax.custom_jvp
     def run(contacts: Contacts, tolerance: Array) -> Solved:
@@ -94,20 +114,21 @@ def differentiable(
         if not exact:
             return result, jax.tree.map(zero_tangent, result)
         with inlined():
-            change = _tangents(result, contacts, tangents[0], components)
+            change = _tangents(form, result, contacts, tangents[0])
         return result, change
 
     return run
 
 
-def _tangents(result: Solved, contacts: Contacts, change: Any, components: tuple[Component, ...]) -> Solved:
+def _tangents(form: _Form, result: Solved, contacts: Contacts, change: Any) -> Solved:
     batch = result.stop.shape
     count = math.prod(batch)
 
     def flat(x: Any) -> Any:
         return x.reshape(count, *x.shape[len(batch) :])
 
-    data, changes = jax.tree.map(flat, contacts), jax.tree.map(flat, change)
+    assert result.point is not None and result.scales is not None
+    data, changes = jax.tree.map(flat, (contacts, change))
     ok = jnp.isfinite(flat(result.verdict.margin)) & (flat(result.stop) != Stop.SKIPPED.value)
     data, changes = safe_contacts(ok, data), jax.tree.map(lambda x, dx: masked(ok, x, dx), data, changes)
     y, u, z = (flat(x) for x in result.point)  # (N, m), (N, d, k), (N, d, k)
@@ -118,14 +139,15 @@ def _tangents(result: Solved, contacts: Contacts, change: Any, components: tuple
         return tuple(lanes[i] for i in range(lanes.shape[0]))
 
     point = Point(-to_lanes(kept(ok, y, 0.0)), None, cone(u), cone(z), NO_BOUNDS, NO_BOUNDS)
-    scales = _scales(data, components)
-    program = _program(data, scales, components)
-    _, residual = jax.jvp(lambda c: residuals(_program(c, scales, components), point), (data,), (changes,))
-    moved = point_tangent(program, point, residual)
-    _, cost = jax.jvp(lambda c: lagrangian(_program(c, scales, components), point), (data,), (changes,))
+    scales = jax.tree.map(lambda x: lax.stop_gradient(to_lanes(kept(ok, flat(x), 1.0))), result.scales)
+    program = _program(form, data, scales)
+    _, residual = jax.jvp(lambda c: residuals(_program(form, c, scales), point), (data,), (changes,))
+    solver = _solver(form, *lax.stop_gradient((data, scales, point)))
+    moved = point_tangent(program, point, residual, solver)
+    _, cost = jax.jvp(lambda c: lagrangian(_program(form, c, scales), point), (data,), (changes,))
     t = 1 - cone_sum(program.price * point.u[0])
     _, force = jax.jvp(
-        lambda c, u, t: _internal_force(c, program.exists, u, t, components),
+        lambda c, u, t: _internal_force(c, program.exists, u, t, form.components),
         (data, point.u, t),
         (changes, moved.u, -cost),
     )

@@ -31,8 +31,9 @@ from .margin import (
     margin_program,
     project,
     starting_point,
+    to_twist,
 )
-from .margin_sensitivity import Solved, differentiable
+from .margin_sensitivity import Scales, Solved, differentiable
 from .singular import row_svd
 from .solver import ConeProgram, Iterate, Progress, Stop
 from .solver.interior_point import begin, solve
@@ -101,6 +102,7 @@ class _Plan(NamedTuple):
     dimension: int
     verdict_only: bool
     width: int
+    with_point: bool  # keep the primal-dual point, for derivatives
 
 
 def _room_for_rounding(folded: Folded, sigma: Array) -> Array:
@@ -178,9 +180,19 @@ def _rank_kernel(plan: _Plan) -> Callable[[Contacts], Rank]:
     return run
 
 
-def _answer_kernel(plan: _Plan) -> Callable[..., Verdict]:
+class _Reading(NamedTuple):
+    """A lane's answer, as rows; the last two only where derivatives may be wanted."""
+
+    verdict: Verdict
+    scales: Scales | None
+    multipliers: Array | None
+
+
+def _answer_kernel(plan: _Plan) -> Callable[..., _Reading]:
     @kernel
-    def run(contacts: Contacts, rows: _State, unbounded: Array, rank_rows: Rank, tolerance: Array) -> Verdict:
+    def run(
+        contacts: Contacts, rows: _State, unbounded: Array, rank_rows: Rank, tolerance: Array
+    ) -> _Reading:
         folded = fold(contacts, plan.components)
         projection = project(folded)
         iterate = rows.unpack().iterate
@@ -197,9 +209,11 @@ def _answer_kernel(plan: _Plan) -> Callable[..., Verdict]:
             to_lanes(contacts.torsion),
             plan.dimension,
         )
-        return verdict._replace(
-            internal_force=to_rows(verdict.internal_force), escape_twist=to_rows(verdict.escape_twist)
-        )
+        scales = multipliers = None
+        if plan.with_point:
+            scales = Scales(folded.length, projection.factor)
+            multipliers = jnp.stack(to_twist(projection, iterate.y))
+        return jax.tree.map(to_rows, _Reading(verdict, scales, multipliers))
 
     return run
 
@@ -235,14 +249,15 @@ def _solve_rows(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array)
     state = lax.fori_loop(0, len(budgets), one_round, setup.state)
     answer = _answer_kernel(plan)
     rows = (contacts, state, setup.unbounded, ranks)
-    verdict = map_tiles(lambda tile: answer(*tile, tolerance), rows, count, width)
-    return Solved(verdict, state.iterations, state.stop, (state.y, state.u, state.z))
+    read = map_tiles(lambda tile: answer(*tile, tolerance), rows, count, width)
+    point = None if read.multipliers is None else (read.multipliers, state.u, state.z)
+    return Solved(read.verdict, state.iterations, state.stop, point, read.scales)
 
 
 @functools.cache
 def _compiled(plan: _Plan) -> Callable[..., WrenchResistance]:
     solve = batched(functools.partial(_solve_rows, plan), lambda rows: rows.active.shape[:-1], plan.width)
-    run = differentiable(solve, plan.components, plan.dimension, exact=not plan.verdict_only)
+    run = differentiable(solve, plan.components, not plan.verdict_only, plan.width)
 
     def result(contacts: Contacts, tolerance: Array) -> WrenchResistance:
         solved = run(contacts, tolerance)
@@ -296,11 +311,11 @@ def wrench_resistance(grasp: Grasp, tolerance: float = 1e-8, verdict_only: bool 
         raise ValueError(f"tolerance must be positive, got {tolerance}")
     components = grasp.model.components(grasp.dimension)
     width = tile_width(wrench_dimension(grasp.dimension) * grasp.contacts * len(components))
-    plan = _Plan(components, grasp.dimension, bool(verdict_only), width)
+    plan = _Plan(components, grasp.dimension, bool(verdict_only), width, False)
     floor = gap_floor(grasp.dtype)
     goal = jnp.maximum(jnp.asarray(tolerance, grasp.dtype), jnp.asarray(floor, grasp.dtype))
     contacts = contacts_of(grasp)
     traced = any(isinstance(x, Tracer) for x in (*contacts, goal))
     if traced or jax.default_backend() != "cpu":
-        return _compiled(plan)(contacts, goal)
+        return _compiled(plan._replace(with_point=not verdict_only))(contacts, goal)
     return _solve_on_host(plan, contacts, goal)

@@ -4,8 +4,9 @@
     d force = one solve with the Newton matrix at the solution                   (implicit function theorem)
 
 A ``custom_jvp`` whose rule calls the same function again, so gradients, Hessians and every nesting are exact. The
-load's size, the length L and the factor of A only scale the problem; the rule holds them fixed. Lanes without an
-optimum, and lanes without a load, have derivative 0.
+load's size, the length L and the norms of the torque rows only scale the problem; the rule holds them fixed. It works
+with A itself: the factor of A serves the linear solve alone. Lanes without an optimum, and lanes without a load, have
+derivative 0.
 """
 
 from __future__ import annotations
@@ -20,23 +21,23 @@ import numpy as np
 from jax import lax
 
 from ._types import Array
-from .balance import Demand, balance, cone_program
+from .balance import Demand, cone_program
 from .cones import Cone, cone_sum
 from .contacts import Component
 from .duality import criterion_value
 from .lanes import to_lanes, to_rows
-from .margin import Contacts, fold, project
+from .margin import Contacts, fold
 from .optimum import Answer
 from .solver import Stop
-from .solver.convex import ConvexProgram, Point, as_vector
-from .solver.implicit import lagrangian, point_tangent, residuals
-from .solver.linear import Cholesky, Vector, solve_lower, solve_transposed
-from .solver.stages import inlined
+from .solver.convex import ConvexProgram, Point
+from .solver.implicit import Motion, lagrangian, newton_solve, point_tangent, residuals
+from .solver.linear import Cholesky
+from .solver.stages import inlined, kernel
 from .status import Status
-from .tangents import in_row_basis, kept, masked, safe_contacts, zero_tangent
+from .tangents import in_tiles, kept, masked, safe_contacts, zero_tangent
 from .verdict import unfold
 
-__all__ = ["Solved", "differentiable"]
+__all__ = ["Scales", "Solved", "differentiable"]
 
 Rows = tuple[Contacts, Demand]
 
@@ -51,7 +52,10 @@ class Scales(NamedTuple):
 
 
 class Solved(NamedTuple):
-    """The solver's part of a result, as rows; ``point`` and ``scales`` only where derivatives may be wanted."""
+    """The solver's part of a result, as rows; ``point`` and ``scales`` only where derivatives may be wanted.
+
+    point  the primal-dual point, its y the multipliers of A itself
+    """
 
     answer: Answer
     iterations: Array
@@ -60,27 +64,23 @@ class Solved(NamedTuple):
     scales: Scales | None
 
 
-def _scales(rows: Rows, components: tuple[Component, ...], dimension: int) -> Scales:
-    contacts, demand = lax.stop_gradient(rows)
-    folded = fold(contacts, components)
-    projection = project(folded)
-    problem = balance(contacts, folded, projection, demand, components, dimension)
-    scales = Scales(folded.length, problem.load.size, projection.factor, problem.row_norm)
-    return lax.stop_gradient(scales)
+class _Form(NamedTuple):
+    """What is fixed at trace time."""
+
+    components: tuple[Component, ...]
+    dimension: int
+    width: int
 
 
-def _program(rows: Rows, scales: Scales, components: tuple[Component, ...], dimension: int) -> ConvexProgram:
-    """The scaled program as a differentiable function of the data."""
+def _program(form: _Form, rows: Rows, scales: Scales) -> ConvexProgram:
+    """The scaled program ``A u = -w / size`` as a differentiable function of the data."""
     contacts, demand = rows
-    folded = fold(contacts, components, scales.length)
-    columns = in_row_basis(scales.factor, folded.columns)
-    m = columns[0].shape[0]
+    folded = fold(contacts, form.components, scales.length)
     wrench = to_lanes(demand.wrench)
-    outer = tuple(wrench[i] if i < dimension else wrench[i] / scales.length for i in range(m))
-    inner, _ = solve_lower(scales.factor, outer)
-    rhs = jnp.stack([-x / scales.size for x in inner])
+    force, torque = wrench[: form.dimension], wrench[form.dimension :] / scales.length
+    rhs = -jnp.concatenate([force, torque]) / scales.size
     program, _, _ = cone_program(
-        contacts, folded.exists, columns, rhs, scales.size, demand, components, scales.row_norm
+        contacts, folded.exists, folded.columns, rhs, scales.size, demand, form.components, scales.row_norm
     )
     return program
 
@@ -127,18 +127,15 @@ class _View(NamedTuple):
     cost: Array
 
 
-def _view(
-    rows: Rows, scales: Scales, point: Point, components: tuple[Component, ...], dimension: int
-) -> _View:
+def _view(form: _Form, rows: Rows, scales: Scales, point: Point) -> _View:
     """Forces, multipliers and the criterion's value, as functions of the data and the point."""
     contacts, demand = rows
     friction, torsion = to_lanes(contacts.friction), to_lanes(contacts.torsion)
-    force = unfold(tuple(scales.size * x for x in point.u), components, friction, torsion)
-    program = _program(rows, scales, components, dimension)
-    squared = program.curvature is not None
-    back = scales.size if squared else jnp.ones_like(scales.size)
-    y: Vector = solve_transposed(scales.factor, as_vector(point.y))
-    twist = jnp.stack([back * (x if i < dimension else x / scales.length) for i, x in enumerate(y)])
+    force = unfold(tuple(scales.size * x for x in point.u), form.components, friction, torsion)
+    program = _program(form, rows, scales)
+    back = scales.size if program.curvature is not None else jnp.ones_like(scales.size)
+    y = back * point.y
+    twist = jnp.concatenate([y[: form.dimension], y[form.dimension :] / scales.length])
     rates = jnp.zeros((0, *scales.size.shape), force.dtype)
     if scales.row_norm is not None:
         assert point.price.upper is not None and point.price.lower is not None
@@ -149,12 +146,10 @@ def _view(
     return _View(force, twist, rates, cost)
 
 
-def _value(
-    rows: Rows, scales: Scales, point: Point, components: tuple[Component, ...], dimension: int
-) -> Array:
+def _value(form: _Form, rows: Rows, scales: Scales, point: Point) -> Array:
     """The Lagrangian in the caller's units, the point fixed."""
     demand = rows[1]
-    program = _program(rows, scales, components, dimension)
+    program = _program(form, rows, scales)
     total = scales.size * lagrangian(program, point)
     if program.curvature is not None:
         total = total * scales.size
@@ -166,10 +161,30 @@ def _value(
     return total
 
 
+def _solver(form: _Form, rows: Rows, scales: Scales, point: Point) -> Callable[[Motion], Motion]:
+    """``newton_solve`` at these points, tile by tile; lanes last outside."""
+
+    @kernel
+    def run(rows: Rows, scales: Scales, point: Point, rhs: Motion) -> Motion:
+        scales, point, rhs = jax.tree.map(to_lanes, (scales, point, rhs))
+        program = _program(form, rows, scales)
+        return jax.tree.map(to_rows, newton_solve(program, point, scales.factor, rhs))
+
+    solve = in_tiles(lambda tile: run(*tile), form.width)
+
+    def solved(rhs: Motion) -> Motion:
+        given = jax.tree.map(to_rows, (scales, point, rhs))
+        with inlined(False):
+            return jax.tree.map(to_lanes, solve((rows, *given)))
+
+    return solved
+
+
 def differentiable(
-    solve: Callable[[Rows, Array], Solved], components: tuple[Component, ...], dimension: int
+    solve: Callable[[Rows, Array], Solved], components: tuple[Component, ...], dimension: int, width: int
 ) -> Callable[[Rows, Array], Solved]:
     """``solve`` with derivatives of cost, bound, force, load_twist and joint_rates in all float rows."""
+    form = _Form(components, dimension, width)
 
     @jax.custom_jvp
     def run(rows: Rows, tolerance: Array) -> Solved:
@@ -180,54 +195,44 @@ def differentiable(
         rows, tolerance = primals
         result = run(rows, tolerance)
         with inlined():
-            change = _tangents(result, rows, tangents[0], components, dimension)
+            change = _tangents(form, result, rows, tangents[0])
         return result, change
 
     return run
 
 
-def _tangents(
-    result: Solved, rows: Rows, change: Rows, components: tuple[Component, ...], dimension: int
-) -> Solved:
+def _tangents(form: _Form, result: Solved, rows: Rows, change: Rows) -> Solved:
     batch = result.answer.status.shape
     count = math.prod(batch)
-    zero = jax.tree.map(zero_tangent, result)
 
     def flat(x: Any) -> Any:
         return x.reshape(count, *x.shape[len(batch) :])
 
-    data = jax.tree.map(flat, rows)
-    changes = jax.tree.map(flat, change)
-    answer = jax.tree.map(flat, result.answer)
+    data, changes = jax.tree.map(flat, (rows, change))
     assert result.point is not None and result.scales is not None
-    stop = flat(result.stop)
-    point, given = jax.tree.map(lambda x: to_lanes(flat(x)), (result.point, result.scales))
-    ok = (answer.status == Status.OPTIMAL.value) & (stop != Stop.SKIPPED.value)
+    status, stop = flat(result.answer.status), flat(result.stop)
+    point, scales = jax.tree.map(lambda x: to_lanes(flat(x)), (result.point, result.scales))
+    ok = (status == Status.OPTIMAL.value) & (stop != Stop.SKIPPED.value)
 
     data = _safe(ok, data)
     changes = jax.tree.map(lambda x, dx: masked(ok, x, dx), data, changes)
     point = _safe_point(ok, point)
-    # The cost needs the solver's own scales only, so that a gradient of costs alone computes nothing twice.
-    given = jax.tree.map(lambda x: lax.stop_gradient(jnp.where(ok, x, jnp.ones_like(x))), given)
-    scales = _scales(data, components, dimension)
+    scales = jax.tree.map(lambda x: lax.stop_gradient(jnp.where(ok, x, jnp.ones_like(x))), scales)
 
-    program = _program(data, scales, components, dimension)
-    _, residual = jax.jvp(
-        lambda r: residuals(_program(r, scales, components, dimension), point), (data,), (changes,)
-    )
-    moved = point_tangent(program, point, residual)
-    _, seen = jax.jvp(
-        lambda r, p: _view(r, scales, p, components, dimension), (data, point), (changes, moved)
-    )
+    program = _program(form, data, scales)
+    _, residual = jax.jvp(lambda r: residuals(_program(form, r, scales), point), (data,), (changes,))
+    fixed = lax.stop_gradient((data, scales, point))
+    moved = point_tangent(program, point, residual, _solver(form, *fixed))
+    _, seen = jax.jvp(lambda r, p: _view(form, r, scales, p), (data, point), (changes, moved))
+    cost = seen.cost
     if data[1].smoothing is None:
-        _, cost = jax.jvp(lambda r: _value(r, given, point, components, dimension), (data,), (changes,))
-    else:
-        cost = seen.cost
+        _, cost = jax.jvp(lambda r: _value(form, r, scales, point), (data,), (changes,))
 
     def back(x: Array) -> Array:
         x = jnp.where(ok, x, jnp.zeros_like(x))
         return to_rows(x).reshape(*batch, *x.shape[:-1])
 
+    zero = jax.tree.map(zero_tangent, result)
     cost = back(cost)
     answer_change = zero.answer._replace(
         force=back(seen.force),
@@ -236,5 +241,4 @@ def _tangents(
         load_twist=back(seen.twist),
         joint_rates=back(seen.rates),
     )
-    point_change = jax.tree.map(back, moved)
-    return zero._replace(answer=answer_change, point=point_change)
+    return zero._replace(answer=answer_change, point=jax.tree.map(back, moved))

@@ -1,7 +1,8 @@
-"""What both derivative rules need: rows made harmless where there is no derivative, and columns in the basis of Q."""
+"""What both derivative rules need: rows made harmless where there is no derivative, and solves tile by tile."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -9,11 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._types import Array
-from .cones import Cone
+from .lanes import batched, map_tiles
 from .margin import Contacts
-from .solver.linear import Cholesky, solve_lower
 
-__all__ = ["in_row_basis", "kept", "masked", "safe_contacts", "zero_tangent"]
+__all__ = ["in_tiles", "kept", "masked", "safe_contacts", "zero_tangent"]
 
 
 def zero_tangent(x: Array) -> Any:
@@ -51,7 +51,11 @@ def safe_contacts(ok: Array, contacts: Contacts) -> Contacts:
     )
 
 
-def in_row_basis(factor: Cholesky, columns: Cone) -> Cone:
-    """``L^-1 A``, d arrays (m, k, L): Q itself, but a differentiable function of A for a fixed L."""
-    m = columns[0].shape[0]
-    return tuple(jnp.stack(solve_lower(factor, tuple(c[i] for i in range(m)))[0]) for c in columns)
+def in_tiles(kernel: Callable[[Any], Any], width: int) -> Callable[[Any], Any]:
+    """``kernel`` on rows, a tile of ``width`` at a time; ``vmap`` adds rows. Their first leaf is (N, k, .)."""
+
+    def run(rows: Any, count: Array, _: Array) -> Any:
+        return map_tiles(kernel, rows, count, width)
+
+    folded = batched(run, lambda rows: jax.tree.leaves(rows)[0].shape[:-2], width)
+    return lambda rows: folded(rows, jnp.zeros((), jnp.int32))

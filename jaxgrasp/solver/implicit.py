@@ -4,17 +4,23 @@ A point on the central path solves, with its own products held fixed,
 
     z = gradient(u, y, prices),  B u = b,  slack = limit - value,  u_i o z_i = (phi_i + mu_i) e,  slack price = floor.
 
-A change of the data leaves residuals in these equations; one solve with the Newton matrix removes them. At the end of
-the iteration mu is rounding-small and the derivative is that of the solution where strict complementarity holds, and
-the limit of the central path's derivatives, one finite choice among several, where it does not. Values need no solve:
-their derivative is that of the Lagrangian with the point fixed (envelope theorem).
+A change of the data leaves residuals in these equations; one solve with the Newton matrix N removes them. Slacks,
+prices and z eliminated, N is symmetric in (u, y, xi, beta):
 
-Plain JAX of any layout, linear in the tangents: it nests, batches and transposes. Source: Fiacco 1983, theorem 3.2.2.
+    (D + W^-2 + head) du + B^T dy - e_0 delta dxi + E^T dbeta = r_u        B du = r_y
+    sum_i delta_i (dxi - du_0,i)                              = r_xi       E du - dbeta / rate = r_beta
+
+so the adjoint equation of reverse mode is the same solve. ``newton_product`` defines N, ``newton_solve`` inverts it;
+``lax.custom_linear_solve`` makes derivatives of all orders of the two. At the end of the iteration mu is
+rounding-small: the derivative is that of the solution where strict complementarity holds; where it does not, it is the
+limit of the central path's derivatives, one finite choice among several. Values need no solve: their derivative is that
+of the Lagrangian with the point fixed (envelope theorem). Source: Fiacco 1983, theorem 3.2.2.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -24,10 +30,12 @@ from jax import lax
 from .._types import Array, pivot_tolerance, unit_roundoff, widest_scaling
 from ..cones import Cone, cone_sum, inner
 from .blocks import Frame, tail_basis, unit_direction
-from .convex import Bounds, ConvexProgram, Optional, Point
-from .kkt import KKT, factor
+from .convex import Bounds, ConvexProgram, Optional, Point, as_vector
+from .kkt import factor
+from .linear import Cholesky, matvec, rmatvec, solve_lower, solve_transposed
+from .stages import stage
 
-__all__ = ["Residuals", "lagrangian", "point_tangent", "residuals"]
+__all__ = ["Motion", "Residuals", "lagrangian", "newton_solve", "point_tangent", "residuals"]
 
 REFINEMENTS = 2
 
@@ -113,63 +121,205 @@ def central_frame(program: ConvexProgram, point: Point) -> Frame:
     return Frame(tail_basis(direction), along, against, across)
 
 
-class _System(NamedTuple):
-    """One factored Newton system, and the equations it solves approximately."""
+class Motion(NamedTuple):
+    """What the Newton matrix acts on, and what it makes of it: u (d arrays (k, L)), y (m, L), xi (L,), beta (q, L)."""
+
+    u: Cone
+    y: Array
+    xi: Optional
+    beta: Optional
+
+
+class _Newton(NamedTuple):
+    """The Newton matrix at a point.
+
+    rates  price / slack of the inequalities      stiffness  z / u in frame coordinates
+    """
 
     program: ConvexProgram
-    masks: Bounds
     rates: Bounds
-    frame: Frame  # as the factorisation uses it: no eigenvalue beyond ``widest_scaling``
-    stiffness: Cone  # the true z / u in frame coordinates
-    kkt: KKT
+    frame: Frame
+    stiffness: Cone
 
 
 def _families(function: Callable, *parts: Bounds) -> Bounds:
     return Bounds(*(None if p[0] is None else function(*p) for p in zip(*parts, strict=True)))
 
 
-def _system(program: ConvexProgram, point: Point) -> _System:
-    masks, frame = program.masks(), central_frame(program, point)
-    rates = _families(lambda m, s, p: m * p / s, masks, point.slack, point.price)
-    eigenvalues = [w for w in (frame.along, frame.against, frame.across) if w is not None]
-    stiffness = [1 / (w * w) for w in eigenvalues]
-    stiffness = (
-        (*stiffness[:2], *(stiffness[2:] * (len(point.u) - 2))) if len(point.u) > 1 else (stiffness[0],)
-    )
-    limit = jnp.asarray(widest_scaling(program.exists.dtype) ** 0.5, program.exists.dtype)
-    cut = [None if w is None else jnp.minimum(w, limit) for w in (frame.along, frame.against, frame.across)]
-    assert cut[0] is not None
-    frame = Frame(frame.basis, cut[0], cut[1], cut[2])
-    # Rows closer to dependent than this make derivatives of rounding: a degenerate optimum gets one finite choice.
+def _newton(program: ConvexProgram, point: Point) -> _Newton:
+    frame = central_frame(program, point)
+    rates = _families(lambda m, s, p: m * p / s, program.masks(), point.slack, point.price)
+    across = [frame.across] * (len(point.u) - 2)
+    eigenvalues = [w for w in (frame.along, frame.against, *across) if w is not None]
+    return _Newton(program, rates, frame, tuple(1 / (w * w) for w in eigenvalues))
+
+
+def newton_product(newton: _Newton, x: Motion) -> Motion:
+    """``N x``."""
+    program, rates, frame = newton.program, newton.rates, newton.frame
+    m = program.rhs.shape[0]
+    rows = x.y if x.beta is None else jnp.concatenate([x.y, x.beta])
+    pulled = rmatvec(program.columns, as_vector(rows))
+    along = frame.to_frame(x.u)
+    stiff = frame.from_frame(tuple(h * a for h, a in zip(newton.stiffness, along, strict=True)))
+    cone = [program.exists * (a + b) for a, b in zip(pulled, stiff, strict=True)]
+    if program.curvature is not None:
+        cone = [a + program.exists * b for a, b in zip(cone, program.curvature.apply(x.u), strict=True)]
+    total = rates.sum_on_head()
+    if total is not None:
+        cone[0] = cone[0] + total * x.u[0]
+    level = beta = None
+    if rates.level is not None:
+        cone[0] = cone[0] - rates.level * x.xi
+        level = cone_sum(rates.level * (x.xi - x.u[0]))
+    applied = matvec(program.columns, x.u)
+    if x.beta is not None:
+        beta = applied[m:] - x.beta / (rates.upper + rates.lower)
+    return Motion(tuple(cone), applied[:m], level, beta)
+
+
+def newton_solve(program: ConvexProgram, point: Point, triangle: Cholesky, rhs: Motion) -> Motion:
+    """``N^-1 rhs``, refined: one lane's bits depend on nothing but its own. ``B = L Q``, Q of orthonormal rows.
+
+    Rows closer to dependent than sqrt(rounding) make derivatives of rounding: they get one finite choice, 0. No
+    eigenvalue of W beyond ``widest_scaling`` enters the factorisation; refinement makes up for the cut.
+    """
+    newton = _prepared(program, point)
+    limit = widest_scaling(program.exists.dtype) ** 0.5
+    frame = _cut(newton.frame, limit)
+    columns = _orthonormal(triangle, program.columns)
+    inside = program._replace(columns=columns)
     dependent = pivot_tolerance(program.exists.dtype) ** 0.5
-    return _System(program, masks, rates, frame, stiffness, factor(program, frame, rates, dependent))
+    kkt = factor(inside, frame, newton.rates, dependent)
+
+    def respond(rhs: Motion) -> Motion:
+        h, head, equations = _scaled_sides(frame, triangle, rhs)
+        solution = kkt.solve(h, head, rhs.xi, equations)
+        return _unscaled(program, frame, triangle, solution.p, solution.xi, solution.rows)
+
+    x = respond(rhs)
+    for _ in range(REFINEMENTS):
+        x = _sum(x, respond(_left(newton, x, rhs)))
+    return x
 
 
-class _Sources(NamedTuple):
-    """Right-hand sides: of the cones (frame coordinates), the scalar inequalities, the rows, the level."""
+# Stages of the solve, which nothing differentiates.
 
-    cone: Cone
-    gains: Bounds
-    missing: Bounds
-    equations: Array
-    level: Optional
+_prepared = stage(_newton)
 
 
-def _respond(system: _System, sources: _Sources) -> Point:
-    """The change of everything but z."""
-    program, rates, masks, frame = system.program, system.rates, system.masks, system.frame
-    exists, m = program.exists, program.rhs.shape[0]
-    pushed = _families(lambda g, r, x: g - r * x, sources.gains, rates, sources.missing)
-    rows = sources.equations
+@stage
+def _cut(frame: Frame, limit: float) -> Frame:
+    along, against, across = (
+        None if w is None else jnp.minimum(w, jnp.asarray(limit, w.dtype))
+        for w in (frame.along, frame.against, frame.across)
+    )
+    assert along is not None
+    return Frame(frame.basis, along, against, across)
+
+
+def _orthonormal(triangle: Cholesky, columns: Cone) -> Cone:
+    """``L^-1 B`` over E."""
+    m = len(triangle.inverse)
+    solved = [solve_lower(triangle, tuple(c[i] for i in range(m)))[0] for c in columns]
+    return _over(solved, tuple(c[m:] for c in columns))
+
+
+@stage
+def _over(upper: list[tuple[Array, ...]], lower: Cone) -> Cone:
+    return tuple(jnp.concatenate([jnp.stack(a), b]) for a, b in zip(upper, lower, strict=True))
+
+
+def _scaled_sides(frame: Frame, triangle: Cholesky, rhs: Motion) -> tuple[Cone, Array, Array]:
+    inner_rows, _ = solve_lower(triangle, as_vector(rhs.y))
+    return _sides(frame, rhs.u, inner_rows, rhs.beta)
+
+
+@stage
+def _sides(frame: Frame, u: Cone, rows: tuple[Array, ...], beta: Optional) -> tuple[Cone, Array, Array]:
+    equations = jnp.stack(rows)
+    if beta is not None:
+        equations = jnp.concatenate([equations, beta])
+    return frame.scale(frame.to_frame(u)), jnp.zeros_like(u[0]), equations
+
+
+def _unscaled(
+    program: ConvexProgram, frame: Frame, triangle: Cholesky, p: Cone, xi: Optional, rows: Array
+) -> Motion:
+    m = program.rhs.shape[0]
+    y = solve_transposed(triangle, as_vector(rows[:m]))
+    return _motion(program.exists, frame, p, y, xi, rows if program.bound is not None else None, m)
+
+
+def _motion(
+    exists: Array, frame: Frame, p: Cone, y: tuple[Array, ...], xi: Optional, rows: Optional, m: int
+) -> Motion:
+    @stage
+    def run(
+        exists: Array, frame: Frame, p: Cone, y: tuple[Array, ...], xi: Optional, rows: Optional
+    ) -> Motion:
+        u = tuple(exists * x for x in frame.from_frame(frame.scale(p)))
+        return Motion(u, jnp.stack(y), xi, None if rows is None else rows[m:])
+
+    return run(exists, frame, p, y, xi, rows)
+
+
+_product = stage(newton_product)
+
+
+@stage
+def _difference(rhs: Motion, product: Motion) -> Motion:
+    return jax.tree.map(jnp.subtract, rhs, product)
+
+
+def _left(newton: _Newton, x: Motion, rhs: Motion) -> Motion:
+    return _difference(rhs, _product(newton, x))
+
+
+@stage
+def _sum(x: Motion, more: Motion) -> Motion:
+    return jax.tree.map(jnp.add, x, more)
+
+
+# The change of a whole point ------------------------------------------------------------------------------
+
+
+def point_tangent(
+    program: ConvexProgram, point: Point, change: Residuals, solve: Callable[[Motion], Motion]
+) -> Point:
+    """The change of the point that cancels ``change``, the change of its residuals; ``solve`` is ``newton_solve``."""
+    newton, masks, exists = _newton(program, point), program.masks(), program.exists
+    rates = newton.rates
+    cone = tuple(-g for g in change.gradient)
+    if change.cone_floor is not None:
+        # u o z = floor e moves z by floor' u^-1, which is z / <u, z> on the central path.
+        share = exists * change.cone_floor / _products(program, point)
+        cone = tuple(a + share * b for a, b in zip(cone, point.z, strict=True))
+    gains = _families(lambda m, f, s: m * f / s, masks, change.floors, point.slack)
+    pushed = _families(lambda g, r, x: g - r * x, gains, rates, change.missing)
+    cone = (cone[0] - exists * pushed.net(), *cone[1:])
+    level = beta = None
+    if gains.level is not None:
+        level = cone_sum(gains.level)
     if pushed.upper is not None and pushed.lower is not None:
-        rows = jnp.concatenate([rows, (pushed.lower - pushed.upper) / (rates.upper + rates.lower)])
-    net = pushed.net()
-    head = exists * net if isinstance(net, Array) else jnp.zeros_like(exists)
-    solution = system.kkt.solve(frame.scale(sources.cone), head, sources.level, rows)
-    du = tuple(exists * x for x in frame.from_frame(frame.scale(solution.p)))
-    slack = sources.missing
+        beta = (pushed.lower - pushed.upper) / (rates.upper + rates.lower)
+    rhs = _tied(Motion(cone, change.equations, level, beta))
+    x = lax.custom_linear_solve(partial(newton_product, newton), rhs, lambda _, b: solve(b), symmetric=True)
+    return _expanded(program, newton, change, gains, x)
+
+
+def _tied(rhs: Motion) -> Motion:
+    """The same numbers, each a function of all: JAX transposes a solve only if no part of its rhs is a constant."""
+    nothing = sum(0 * jnp.sum(x, axis=tuple(range(x.ndim - 1))) for x in jax.tree.leaves(rhs))
+    return jax.tree.map(lambda x: x + nothing, rhs)
+
+
+def _expanded(program: ConvexProgram, newton: _Newton, change: Residuals, gains: Bounds, x: Motion) -> Point:
+    """Slacks, prices and z from the rest."""
+    masks, exists, du = program.masks(), program.exists, x.u
+    slack = change.missing
     if slack.level is not None:
-        slack = slack._replace(level=masks.level * (solution.xi - du[0]))
+        slack = slack._replace(level=masks.level * (x.xi - du[0]))
     if slack.cap is not None:
         slack = slack._replace(cap=slack.cap - masks.cap * du[0])
     if slack.head is not None:
@@ -177,40 +327,7 @@ def _respond(system: _System, sources: _Sources) -> Point:
     if slack.upper is not None:
         _, product = program.products(du)
         slack = slack._replace(upper=slack.upper - product, lower=slack.lower + product)
-    price = _families(lambda g, r, s: g - r * s, sources.gains, rates, slack)
-    return Point(solution.rows[:m], solution.xi, du, du, slack, price)
-
-
-def point_tangent(program: ConvexProgram, point: Point, change: Residuals) -> Point:
-    """The change of the point that cancels ``change``, the change of its residuals."""
-    system = _system(program, point)
-    exists, frame = program.exists, system.frame
-    lift: Cone = tuple(jnp.zeros_like(exists) for _ in point.u)
-    if change.cone_floor is not None:
-        # u o z = floor e moves z by floor' u^-1, which is z / <u, z> on the central path.
-        share = exists * change.cone_floor / _products(program, point)
-        lift = frame.to_frame(tuple(share * x for x in point.z))
-
-    gains = _families(lambda m, f, s: m * f / s, system.masks, change.floors, point.slack)
-    none = _families(jnp.zeros_like, gains)
-    level = None if gains.level is None else cone_sum(gains.level)
-    start = tuple(a - b for a, b in zip(lift, frame.to_frame(change.gradient), strict=True))
-    total = _respond(system, _Sources(start, gains, change.missing, change.equations, level))
-    for _ in range(REFINEMENTS):
-        dz = _dual_change(program, total, change)
-        along = frame.to_frame(total.u)
-        error = tuple(
-            exists * (f - a - h * b)
-            for f, a, h, b in zip(lift, frame.to_frame(dz), system.stiffness, along, strict=True)
-        )
-        equations = change.equations - program.products(total.u)[0]
-        level = None if total.price.level is None else cone_sum(total.price.level)
-        more = _respond(system, _Sources(error, none, none, equations, level))
-        total = jax.tree.map(jnp.add, total, more)
-    return total._replace(z=_dual_change(program, total, change))
-
-
-def _dual_change(program: ConvexProgram, moved: Point, change: Residuals) -> Cone:
-    """dz by stationarity."""
-    dz = program.gradient(moved.u, moved.rows(), moved.price.net())
-    return tuple(program.exists * (a + b) for a, b in zip(dz, change.gradient, strict=True))
+    price = _families(lambda g, r, s: g - r * s, gains, newton.rates, slack)
+    moved = Point(x.y, x.xi, du, du, slack, price)
+    dz = program.gradient(du, moved.rows(), price.net())
+    return moved._replace(z=tuple(exists * (a + b) for a, b in zip(dz, change.gradient, strict=True)))

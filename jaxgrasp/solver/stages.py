@@ -38,9 +38,12 @@ _SMALL = {"inlineable": "false", "xla_cpu_small_call": "true"}
 
 
 @contextmanager
-def inlined() -> Iterator[None]:
-    """Stages traced inside are plain functions, which JAX differentiates, batches and transposes as it likes."""
-    token = _INLINED.set(True)
+def inlined(on: bool = True) -> Iterator[None]:
+    """Stages traced inside are plain functions, which JAX differentiates, batches and transposes as it likes.
+
+    ``inlined(False)`` inside it: stages again, for what JAX is told not to look into.
+    """
+    token = _INLINED.set(on)
     try:
         yield
     finally:
