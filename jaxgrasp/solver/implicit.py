@@ -197,9 +197,10 @@ def newton_solve(program: ConvexProgram, point: Point, triangle: Cholesky, rhs: 
         solution = kkt.solve(h, head, rhs.xi, equations)
         return _unscaled(program, frame, triangle, solution.p, solution.xi, solution.rows)
 
-    x = respond(rhs)
+    x = change = respond(rhs)
     for _ in range(REFINEMENTS):
-        x = _sum(x, respond(_left(newton, x, rhs)))
+        change = respond(_left(newton, frame, change, x, rhs))
+        x = _sum(x, change)
     return x
 
 
@@ -264,16 +265,20 @@ def _motion(
     return run(exists, frame, p, y, xi, rows)
 
 
-_product = stage(newton_product)
-
-
 @stage
-def _difference(rhs: Motion, product: Motion) -> Motion:
-    return jax.tree.map(jnp.subtract, rhs, product)
+def _left(newton: _Newton, cut: Frame, change: Motion, x: Motion, rhs: Motion) -> Motion:
+    """What the cut left of ``change``, and what rounding left of ``B u = r_y``.
 
-
-def _left(newton: _Newton, x: Motion, rhs: Motion) -> Motion:
-    return _difference(rhs, _product(newton, x))
+    ``rhs - N x`` itself would be noise: rates grow like 1 / gap, and multiply the rounding of u.
+    """
+    along = cut.to_frame(change.u)
+    eigenvalues = [w for w in (cut.along, cut.against, *[cut.across] * (len(along) - 2)) if w is not None]
+    excess = (1 / (w * w) - h for w, h in zip(eigenvalues, newton.stiffness, strict=True))
+    cone = cut.from_frame(tuple(h * a for h, a in zip(excess, along, strict=True)))
+    m = rhs.y.shape[0]
+    applied = matvec(tuple(c[:m] for c in newton.program.columns), x.u)
+    zero = jax.tree.map(jnp.zeros_like, (rhs.xi, rhs.beta))
+    return Motion(cone, rhs.y - applied, *zero)
 
 
 @stage
