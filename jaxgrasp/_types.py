@@ -15,7 +15,9 @@ __all__ = [
     "Float",
     "Int",
     "SpokenEnum",
+    "complementary_ratio",
     "gap_floor",
+    "largest_response",
     "pivot_tolerance",
     "rank_tolerance",
     "rounding_constant",
@@ -70,6 +72,19 @@ def widest_scaling(dtype) -> float:
     Beyond it, what the matrix must resolve next to its largest entries is lost; refinement makes up for the cut.
     """
     return 1e7 if jnp.dtype(dtype).itemsize == 8 else 1e3
+
+
+def complementary_ratio(dtype) -> float:
+    """A pair of complementary numbers counts as (positive, 0) from this ratio on: 1e3 (float64), 30 (float32).
+
+    At a relative gap of 1e-8 it is about 1e8 where complementarity is strict, and about 1 where it is not.
+    """
+    return 1e3 if jnp.dtype(dtype).itemsize == 8 else 30.0
+
+
+def largest_response(dtype) -> float:
+    """Forces that answer a change of size 1 by more than this are not unique: 1e5 (float64), 1e3 (float32)."""
+    return 1e5 if jnp.dtype(dtype).itemsize == 8 else 1e3
 
 
 def rounding_constant() -> float:

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
-from ._types import Array, Float, Int, gap_floor, unit_roundoff
+from ._types import Array, Bool, Float, Int, gap_floor, unit_roundoff
 from .balance import Balance, Demand, balance, proves, starting_point
 from .contacts import Component
 from .criteria import Criterion, Gentlest
@@ -30,11 +30,13 @@ from .sensitivity import Rows, Scales, Solved, differentiable
 from .solver import Stop
 from .solver.convex import as_vector
 from .solver.primal_dual import State, begin, solve
+from .solver.regularity import regular
 from .solver.stages import kernel
+from .status import Status
 
 __all__ = ["ForceOptimum", "optimize_forces"]
 
-FIRST_BUDGET = 11  # iterations before stragglers are gathered
+FIRST_BUDGET = 12  # iterations before stragglers are gathered
 TOTAL_BUDGET = 60
 CHUNK = 4096  # problems an executable takes at once when called on concrete arrays
 
@@ -50,6 +52,8 @@ class ForceOptimum(eqx.Module):
     escape_twist  (*batch, m) (velocity; angular velocity), unit norm: the proof of INFEASIBLE; else zero
     load_twist    (*batch, m) derivative of the optimal cost with respect to the wrench: the twist behind ``bound``
     joint_rates   (*batch, q) multipliers of the torque limits; with them the twists prove what they prove
+    smooth        bool: forces and multipliers are unique and strictly complementary, so that they have derivatives;
+                  elsewhere their derivatives are one finite choice. False where not OPTIMAL
     iterations    int32 interior-point iterations spent
     stop          int32, a ``solver.Stop``: why the iteration ended
     wrench, criterion, max_normal, torque_limits, smoothing  the problem, as it was asked
@@ -62,6 +66,7 @@ class ForceOptimum(eqx.Module):
     escape_twist: Float[Array, "*batch m"]
     load_twist: Float[Array, "*batch m"]
     joint_rates: Float[Array, "*batch q"]
+    smooth: Bool[Array, "*batch"]
     iterations: Int[Array, "*batch"]
     stop: Int[Array, "*batch"]
     wrench: Float[Array, "*batch m"]
@@ -104,11 +109,13 @@ def _problem(plan: _Plan, rows: Rows):
 class _Progress(NamedTuple):
     """What a sweep over the tiles leaves behind, as rows; the last two only where derivatives may be wanted.
 
+    smooth       whether the optimum moves smoothly with the data
     multipliers  (m,) of A itself, where those of the state belong to its orthonormal rows
     """
 
     state: State
     answer: Answer
+    smooth: Array
     scales: Scales | None
     multipliers: Array | None
 
@@ -142,11 +149,15 @@ def _tile_kernel(plan: _Plan) -> Callable[..., _Progress]:
 def _progress(
     plan: _Plan, state: State, result: Answer, folded: Folded, projection: Projection, problem: Balance
 ) -> _Progress:
+    optimal = (result.status == Status.OPTIMAL.value) & (state.stop != Stop.SKIPPED.value)
+    smooth = optimal
+    if problem.program.smoothing is None:
+        smooth = optimal & regular(problem.program, state.point)
     if not plan.with_point:
-        return _Progress(state, result, None, None)
+        return _Progress(state, result, smooth, None, None)
     scales = Scales(folded.length, problem.load.size, projection.factor, problem.row_norm)
     y = state.point.y
-    return _Progress(state, result, scales, jnp.stack(to_twist(projection, as_vector(y))))
+    return _Progress(state, result, smooth, scales, jnp.stack(to_twist(projection, as_vector(y))))
 
 
 def _solve_rows(plan: _Plan, rows: Rows, count: Array, tolerance: Array) -> Solved:
@@ -162,9 +173,9 @@ def _solve_rows(plan: _Plan, rows: Rows, count: Array, tolerance: Array) -> Solv
         return progress.state.stop == Stop.RUNNING.value
 
     shapes = _shapes(plan, rows)
-    state, answers, scales, y = in_sweeps(advance, rows, shapes, unfinished, count, 2, plan.width)
+    state, answers, smooth, scales, y = in_sweeps(advance, rows, shapes, unfinished, count, 2, plan.width)
     point = None if y is None else state.point._replace(y=y)
-    return Solved(answers, state.iterations, state.stop, point, scales)
+    return Solved(answers, smooth, state.iterations, state.stop, point, scales)
 
 
 def _shapes(plan: _Plan, rows: Rows) -> _Progress:
@@ -357,6 +368,6 @@ def optimize_forces(
     a = solved.answer
     limits = None if demand.jacobian is None or demand.torque is None else (demand.jacobian, demand.torque)
     return ForceOptimum(
-        a.status, a.force, a.cost, a.bound, a.escape_twist, a.load_twist, a.joint_rates, solved.iterations,
-        solved.stop, loads, demand.criterion, demand.cap, limits, float(smoothing),
+        a.status, a.force, a.cost, a.bound, a.escape_twist, a.load_twist, a.joint_rates, solved.smooth,
+        solved.iterations, solved.stop, loads, demand.criterion, demand.cap, limits, float(smoothing),
     )  # fmt: skip

@@ -58,6 +58,7 @@ class Solved(NamedTuple):
     """
 
     answer: Answer
+    smooth: Array
     iterations: Array
     stop: Array
     point: Point | None

@@ -37,6 +37,7 @@ FLOORS = [
     "solver.newton",
     "solver.primal_dual",
     "solver.implicit",
+    "solver.regularity",
     "solver",
     # answers and their proofs
     "status",

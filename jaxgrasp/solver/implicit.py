@@ -35,7 +35,16 @@ from .kkt import factor
 from .linear import Cholesky, matvec, rmatvec, solve_lower, solve_transposed
 from .stages import stage
 
-__all__ = ["Motion", "Residuals", "lagrangian", "newton_solve", "point_tangent", "residuals"]
+__all__ = [
+    "Motion",
+    "Newton",
+    "Residuals",
+    "lagrangian",
+    "newton_at",
+    "newton_solve",
+    "point_tangent",
+    "residuals",
+]
 
 REFINEMENTS = 2
 
@@ -130,7 +139,7 @@ class Motion(NamedTuple):
     beta: Optional
 
 
-class _Newton(NamedTuple):
+class Newton(NamedTuple):
     """The Newton matrix at a point.
 
     rates  price / slack of the inequalities      stiffness  z / u in frame coordinates
@@ -146,15 +155,16 @@ def _families(function: Callable, *parts: Bounds) -> Bounds:
     return Bounds(*(None if p[0] is None else function(*p) for p in zip(*parts, strict=True)))
 
 
-def _newton(program: ConvexProgram, point: Point) -> _Newton:
+def newton_at(program: ConvexProgram, point: Point) -> Newton:
+    """The Newton matrix at a point on the central path."""
     frame = central_frame(program, point)
     rates = _families(lambda m, s, p: m * p / s, program.masks(), point.slack, point.price)
     across = [frame.across] * (len(point.u) - 2)
     eigenvalues = [w for w in (frame.along, frame.against, *across) if w is not None]
-    return _Newton(program, rates, frame, tuple(1 / (w * w) for w in eigenvalues))
+    return Newton(program, rates, frame, tuple(1 / (w * w) for w in eigenvalues))
 
 
-def newton_product(newton: _Newton, x: Motion) -> Motion:
+def newton_product(newton: Newton, x: Motion) -> Motion:
     """``N x``."""
     program, rates, frame = newton.program, newton.rates, newton.frame
     m = program.rhs.shape[0]
@@ -206,7 +216,7 @@ def newton_solve(program: ConvexProgram, point: Point, triangle: Cholesky, rhs: 
 
 # Stages of the solve, which nothing differentiates.
 
-_prepared = stage(_newton)
+_prepared = stage(newton_at)
 
 
 @stage
@@ -266,7 +276,7 @@ def _motion(
 
 
 @stage
-def _left(newton: _Newton, cut: Frame, change: Motion, x: Motion, rhs: Motion) -> Motion:
+def _left(newton: Newton, cut: Frame, change: Motion, x: Motion, rhs: Motion) -> Motion:
     """What the cut left of ``change``, and what rounding left of ``B u = r_y``.
 
     ``rhs - N x`` itself would be noise: rates grow like 1 / gap, and multiply the rounding of u.
@@ -293,7 +303,7 @@ def point_tangent(
     program: ConvexProgram, point: Point, change: Residuals, solve: Callable[[Motion], Motion]
 ) -> Point:
     """The change of the point that cancels ``change``, the change of its residuals; ``solve`` is ``newton_solve``."""
-    newton, masks, exists = _newton(program, point), program.masks(), program.exists
+    newton, masks, exists = newton_at(program, point), program.masks(), program.exists
     rates = newton.rates
     cone = tuple(-g for g in change.gradient)
     if change.cone_floor is not None:
@@ -319,7 +329,7 @@ def _tied(rhs: Motion) -> Motion:
     return jax.tree.map(lambda x: x + nothing, rhs)
 
 
-def _expanded(program: ConvexProgram, newton: _Newton, change: Residuals, gains: Bounds, x: Motion) -> Point:
+def _expanded(program: ConvexProgram, newton: Newton, change: Residuals, gains: Bounds, x: Motion) -> Point:
     """Slacks, prices and z from the rest."""
     masks, exists, du = program.masks(), program.exists, x.u
     slack = change.missing
@@ -333,6 +343,11 @@ def _expanded(program: ConvexProgram, newton: _Newton, change: Residuals, gains:
         _, product = program.products(du)
         slack = slack._replace(upper=slack.upper - product, lower=slack.lower + product)
     price = _families(lambda g, r, s: g - r * s, gains, newton.rates, slack)
+    if price.upper is not None and price.lower is not None:
+        # ``r s`` carries the rounding of du times rates up to 1 / gap; beta does not: it says what it was.
+        error = x.beta - (price.upper - price.lower)
+        upper = price.upper + error * newton.rates.upper / (newton.rates.upper + newton.rates.lower)
+        price = price._replace(upper=upper, lower=upper - x.beta)
     moved = Point(x.y, x.xi, du, du, slack, price)
     dz = program.gradient(du, moved.rows(), price.net())
     return moved._replace(z=tuple(exists * (a + b) for a, b in zip(dz, change.gradient, strict=True)))

@@ -213,15 +213,21 @@ class Aim(NamedTuple):
 
 @stage
 def _aim(
-    before: Array, after: Array, count: Array, closed: Array, infeasibility: Array, weight: Array
+    before: Array,
+    after: Array,
+    count: Array,
+    closed: Array,
+    centred: Array,
+    infeasibility: Array,
+    weight: Array,
 ) -> Aim:
-    """Mehrotra's ``sigma = ratio^3``. In ``closed`` lanes sigma = 1, until what is left of the residuals is small
-    next to a product; then the residuals alone."""
+    """Mehrotra's ``sigma = ratio^3``. In ``closed`` lanes sigma = 1, until the point is centred and what is left of the
+    residuals is small next to a product; then the residuals alone."""
     zero, one = jnp.zeros_like(after), jnp.ones_like(after)
     ratio = jnp.where(closed, one, jnp.minimum(jnp.maximum(after / before, zero), one))
     sigma = ratio * ratio * ratio
     mu = sigma * before / count
-    drive = jnp.where(closed & (infeasibility <= SMALL_RESIDUAL * mu), zero, one)
+    drive = jnp.where(closed & centred & (infeasibility <= SMALL_RESIDUAL * mu), zero, one)
     fraction = jnp.maximum(
         jnp.minimum(1 - 0.3 * ratio, jnp.full_like(ratio, LONGEST_FRACTION)), SHORTEST_FRACTION
     )
@@ -236,9 +242,9 @@ def _length(reach: Array, fraction: Array) -> Array:
 
 
 def newton_step(
-    program: ConvexProgram, point: Point, excess: Array, infeasibility: Array, closed: Array
+    program: ConvexProgram, point: Point, excess: Array, infeasibility: Array, closed: Array, centred: Array
 ) -> tuple[Point, Step]:
-    """One predictor-corrector step. Lanes in ``closed`` keep the size of their products and mend their residuals."""
+    """One predictor-corrector step. Lanes in ``closed`` keep the size of their products, centre, and mend residuals."""
     scaling = nesterov_todd(point.u, point.z)
     frame, lam = _frame(scaling.w, scaling.eta, point.z)
     local = _local(program, point)
@@ -261,6 +267,6 @@ def newton_step(
     after, count = measure(program, ahead.u, ahead.z, ahead.slack, ahead.price)
     # Far from a fixed barrier's floor the full second-order correction overshoots.
     weight = one if program.cone_floor is None and program.smoothing is None else length
-    aim = _aim(excess, after, count, closed, infeasibility, weight)
+    aim = _aim(excess, after, count, closed, centred, infeasibility, weight)
     step, reach = direction(aim.mu, aim.share, aim.drive, aim.weight, affine)
     return _moved(point, step, _length(reach, aim.fraction)), step

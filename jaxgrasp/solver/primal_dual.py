@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from .._types import Array
-from ..cones import cone_max, cone_min, cone_sum, interior_distance
+from ..cones import cone_max, cone_min, cone_sum, inner, interior_distance
 from .convex import ConvexProgram, Point
 from .interior_point import Stop
 from .newton import measure, newton_step
@@ -26,6 +26,7 @@ __all__ = ["Answered", "State", "begin", "solve"]
 
 STALL_RATIO = 0.9  # a step that leaves more of the gap than this is slow
 PATIENCE = 4  # slow steps in a row before a lane gives up
+CENTRED = 1e3  # tails of u o z, in products, that still leave forces right to 1e-7 at a gap of 1e-8
 ALMOST = 1e-6  # slow steps count only once |b - B u| is below this: before, growth of y is progress
 
 
@@ -34,12 +35,14 @@ class State(NamedTuple):
 
     excess         (L,) sum of |product - floor|: the duality gap once B u = b
     infeasibility  (L,) |b - B u| plus what caps and bounds lack
+    centred        (L,) bool: u_i and z_i are aligned; <u, z> = mu alone leaves the direction of u open to sqrt(mu)
     ray            (m + q, L) the multipliers that answered, where the lane stopped DECIDED
     """
 
     point: Point
     excess: Array
     infeasibility: Array
+    centred: Array
     ray: Array
     iterations: Array
     stalled: Array
@@ -80,6 +83,18 @@ def _room(program: ConvexProgram, point: Point) -> tuple[Array, Array, Array]:
 
 
 @stage
+def _centred(program: ConvexProgram, point: Point) -> Array:
+    """Whether ``|u_0 z_t + z_0 u_t|`` is small next to ``<u, z>`` in every cone (L,)."""
+    u, z = point.u, point.z
+    square = jnp.zeros_like(u[0])
+    for a, b in zip(u[1:], z[1:], strict=True):
+        tail = u[0] * b + z[0] * a
+        square = square + tail * tail
+    most = jnp.asarray(CENTRED, square.dtype) * inner(u, z)
+    return cone_max(program.exists * (square - most * most)) <= 0
+
+
+@stage
 def _select(taken: Array, new: Point, old: Point) -> Point:
     return jax.tree.map(lambda a, b: jnp.where(taken, a, b), new, old)
 
@@ -101,8 +116,9 @@ def closed(program: ConvexProgram, state: State, tolerance: Array) -> Array:
 
 @stage
 def _judged(
-    state: State, point: Point, excess: Array, infeasibility: Array, primal: Array, dual: Array, close: Array,
-    was_close: Array, proven: Array, by_step: Array, rows: Array, change: Array, largest: Array, fine: float,
+    state: State, point: Point, excess: Array, infeasibility: Array, centred: Array, primal: Array,
+    dual: Array, close: Array, was_close: Array, proven: Array, by_step: Array, rows: Array, change: Array,
+    largest: Array, fine: float,
 ) -> State:  # fmt: skip
     """Take the step in the lanes where it is sound; say why the others stop."""
     running = state.stop == Stop.RUNNING.value
@@ -118,16 +134,19 @@ def _judged(
     stop = code(Stop.STALLED, stalled >= PATIENCE, jnp.zeros_like(state.stop))
     stop = code(Stop.BREAKDOWN, ~sound, stop)
     stop = code(Stop.DECIDED, (proven | by_step) & ~was_close, stop)
-    stop = code(Stop.CONVERGED, sound & close & met, stop)
+    stop = code(Stop.CONVERGED, sound & close & met & centred, stop)
     ray = jnp.where(running & by_step, change, jnp.where(running, rows, state.ray))
     iterations = jnp.where(running, state.iterations + 1, state.iterations)
-    return State(point, excess, infeasibility, ray, iterations, stalled, jnp.where(running, stop, state.stop))
+    stop = jnp.where(running, stop, state.stop)
+    return State(point, excess, infeasibility, centred, ray, iterations, stalled, stop)
 
 
 def advance(program: ConvexProgram, state: State, tolerance: Array, proves: Answered, fine: float) -> State:
     """One iteration of every running lane."""
     was_close = closed(program, state, tolerance)
-    moved, step = newton_step(program, state.point, state.excess, state.infeasibility, was_close)
+    moved, step = newton_step(
+        program, state.point, state.excess, state.infeasibility, was_close, state.centred
+    )
     primal, dual, largest = _room(program, moved)
     point = _select(_running_and(state.stop, primal, dual), moved, state.point)
     excess, _ = measure(program, point.u, point.z, point.slack, point.price)
@@ -135,9 +154,9 @@ def advance(program: ConvexProgram, state: State, tolerance: Array, proves: Answ
     close = closed(
         program, state._replace(point=point, excess=excess, infeasibility=infeasibility), tolerance
     )
-    rows = _rows(point)
+    rows, centred = _rows(point), _centred(program, point)
     return _judged(
-        state, point, excess, infeasibility, primal, dual, close, was_close, proves(program, rows),
+        state, point, excess, infeasibility, centred, primal, dual, close, was_close, proves(program, rows),
         proves(program, step.rows), rows, step.rows, largest, fine,
     )  # fmt: skip
 
@@ -157,7 +176,8 @@ def begin(program: ConvexProgram, point: Point, skip: Array) -> State:
     excess, _ = measure(program, point.u, point.z, point.slack, point.price)
     zero = jnp.zeros(excess.shape, jnp.int32)
     code = jnp.where(skip, jnp.int32(Stop.SKIPPED.value), jnp.int32(Stop.RUNNING.value))
-    return State(point, excess, _infeasibility(program, point), _rows(point), zero, zero, code)
+    infeasibility, centred = _infeasibility(program, point), jnp.zeros_like(skip)
+    return State(point, excess, infeasibility, centred, _rows(point), zero, zero, code)
 
 
 def solve(
