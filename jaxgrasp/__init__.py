@@ -6,6 +6,16 @@ Names follow the chapter "Wrench Resistant Grasps"; wrench resistance is what ot
 from .certificate import check_certificate
 from .contacts import ContactModel, Frictionless, HardFinger, SoftFinger
 from .criteria import Criterion, Gentlest, LeastNorm, Robust, SmallestSum, SumOfSquares
+from .dynamics import (
+    BodyState,
+    RigidBody,
+    acceleration,
+    advance,
+    coriolis,
+    gravity_term,
+    mass_matrix,
+    world_grasp_map,
+)
 from .equilibrium import (
     Equilibrium,
     EquilibriumKind,
@@ -101,6 +111,15 @@ __all__ = [
     "ResistibleWrenches",
     "lmi_forces",
     "LMIForces",
+    # 11.4 dynamics and controllability
+    "RigidBody",
+    "BodyState",
+    "mass_matrix",
+    "coriolis",
+    "gravity_term",
+    "world_grasp_map",
+    "acceleration",
+    "advance",
     # answers and their proofs
     "Status",
     "check_certificate",

@@ -59,6 +59,9 @@ FLOORS = [
     "forces",
     "equilibrium",
     "tracing",
+    # motion
+    "rotations",
+    "dynamics",
     # the roof
     "errors",
     "backend",
