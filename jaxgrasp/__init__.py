@@ -5,6 +5,13 @@ Names follow the chapter "Wrench Resistant Grasps"; wrench resistance is what ot
 
 from .certificate import check_certificate
 from .contacts import ContactModel, Frictionless, HardFinger, SoftFinger
+from .controllability import (
+    Controllability,
+    ControllabilityVerdict,
+    controllability,
+    controllability_matrix,
+    gramian,
+)
 from .criteria import Criterion, Gentlest, LeastNorm, Robust, SmallestSum, SumOfSquares
 from .dynamics import (
     BodyState,
@@ -35,6 +42,7 @@ from .grasp import (
     internal_force_part,
     null_space,
 )
+from .linearization import Linearization, OperatingPoint, linearize
 from .lmi import (
     FrictionLMI,
     LMIFeasibility,
@@ -52,6 +60,7 @@ from .lmi import (
 )
 from .lmi_forces import LMIForces, lmi_forces
 from .resistance import WrenchResistance, wrench_resistance
+from .simulation import MujocoPlant, mujoco_model, mujoco_plant
 from .solver import Stop
 from .status import Status
 from .tracing import Trace, load_grasp, save_grasp, trace
@@ -120,6 +129,17 @@ __all__ = [
     "world_grasp_map",
     "acceleration",
     "advance",
+    "linearize",
+    "Linearization",
+    "OperatingPoint",
+    "controllability",
+    "Controllability",
+    "ControllabilityVerdict",
+    "controllability_matrix",
+    "gramian",
+    "mujoco_plant",
+    "mujoco_model",
+    "MujocoPlant",
     # answers and their proofs
     "Status",
     "check_certificate",
