@@ -1,4 +1,4 @@
-"""Grasped objects in MuJoCo: thousands at a time in MJX, one at a time in its C engine. The only module that imports it.
+"""Grasped objects in MuJoCo, the only module that imports it: thousands at a time in MJX, one at a time in C.
 
 The model is one body on a free joint, with the object's mass and inertia, and without contacts: the contact forces of
 the grasp are applied as a wrench at the centre of mass, and turn with the body. MuJoCo's own conventions stay inside:
@@ -21,7 +21,7 @@ import numpy as np
 from ._types import Array, Float
 from .dynamics import BodyState, RigidBody, gravity_vector, world_grasp_map
 from .grasp import Grasp
-from .rotations import rotate, rotation_between
+from .rotations import rotate, rotation_between, turned
 
 __all__ = ["MujocoPlant", "mujoco_model", "mujoco_plant", "tangent", "tangent_difference"]
 
@@ -37,6 +37,7 @@ TEMPLATE = """
   </worldbody>
 </mujoco>
 """
+STILL = 1.1e-8  # rad/s, just above MJX's own threshold
 GEOMETRY = '<geom name="object" type="mesh" mesh="object" contype="0" conaffinity="0" rgba=".75 .75 .8 1"/>'
 
 
@@ -131,24 +132,34 @@ class MujocoPlant(eqx.Module):
         return self.template.replace(qpos=qpos, qvel=qvel, xfrc_applied=applied)
 
     def _step(self, model: Any, state: BodyState, wrench: Array) -> BodyState:
-        data = _mjx().step(model, self._data(state, wrench))
-        spin = rotate(data.qpos[3:], data.qvel[3:])
-        return BodyState(data.qpos[:3], data.qpos[3:], jnp.concatenate([data.qvel[:3], spin]))
+        with jax.numpy_dtype_promotion("standard"):  # MJX mixes integers, booleans and floats
+            data = _mjx().step(model, self._data(state, wrench))
+        # MJX takes angular velocities below 1e-8 for none: right to rounding in value, but its derivative of the
+        # rotation by the angular velocity is then 0 instead of h. There the rotation is ours.
+        spin = rotate(state.orientation, data.qvel[3:])
+        still = jnp.all(jnp.abs(data.qvel[3:]) <= STILL)
+        orientation = jnp.where(still, turned(state.orientation, model.opt.timestep * spin), data.qpos[3:])
+        spin = rotate(orientation, data.qvel[3:])
+        return BodyState(data.qpos[:3], orientation, jnp.concatenate([data.qvel[:3], spin]))
 
     def _qacc(self, model: Any, state: BodyState, wrench: Array) -> Array:
-        qacc = _mjx().forward(model, self._data(state, wrench)).qacc
+        with jax.numpy_dtype_promotion("standard"):
+            qacc = _mjx().forward(model, self._data(state, wrench)).qacc
         return jnp.concatenate([qacc[:3], rotate(state.orientation, qacc[3:])])
 
+    @eqx.filter_jit
     def advance(self, state: BodyState, wrench: Float[Array, "*batch 6"]) -> BodyState:
         """One step of MuJoCo under ``wrench`` (N, N m; world axes, at the centre of mass)."""
         return self._over_batch(self._step, state, wrench)
 
+    @eqx.filter_jit
     def acceleration(self, state: BodyState, wrench: Float[Array, "*batch 6"]) -> Float[Array, "*batch 6"]:
         """MuJoCo's ``qacc`` in world axes, m/s^2 and rad/s^2."""
         return self._over_batch(self._qacc, state, wrench)
 
+    @eqx.filter_jit
     def roll_out(self, state: BodyState, grasp: Grasp, force: Float[Array, "t *batch kn"]) -> BodyState:
-        """The states after each of the steps in which the contact forces are ``force[0]``, ``force[1]`` ..; (T, *batch)."""
+        """The states (T, *batch) after each of T steps with the contact forces ``force[0]``, ``force[1]`` .."""
 
         def step(now: BodyState, f: Array) -> tuple[BodyState, BodyState]:
             after = self.advance(now, _applied(world_grasp_map(grasp, now.orientation), f))
@@ -156,12 +167,14 @@ class MujocoPlant(eqx.Module):
 
         return jax.lax.scan(step, state, force)[1]
 
+    @eqx.filter_jit
     def step_derivatives(
         self, state: BodyState, grasp: Grasp, force: Float[Array, "*batch kn"]
     ) -> tuple[Float[Array, "*batch 12 12"], Float[Array, "*batch 12 kn"]]:
         """A and B of MuJoCo's own step, ``x+ = A x + B f`` for tangent vectors at ``state`` and at its successor."""
         return self._derivatives(state, grasp, force, self._step_change)
 
+    @eqx.filter_jit
     def acceleration_derivatives(
         self, state: BodyState, grasp: Grasp, force: Float[Array, "*batch kn"]
     ) -> tuple[Float[Array, "*batch 6 12"], Float[Array, "*batch 6 kn"]]:

@@ -47,14 +47,14 @@ def test_accelerations_agree_in_any_state(scene):
     state = random_states(np.random.default_rng(1), N, 3, speed=3.0)
     wrench = jnp.einsum("nij,nj->ni", jg.world_grasp_map(grasp, state.orientation), force)
     ours = jg.acceleration(body, state, wrench, gravity)
-    assert relative(jax.jit(plant.acceleration)(state, wrench), ours).max() < 1e-9
+    assert relative(plant.acceleration(state, wrench), ours).max() < 1e-9
 
 
 def test_one_step_is_semi_implicit_euler(scene):
     body, grasp, force, gravity, _, plant = scene
     state = random_states(np.random.default_rng(2), N, 3, speed=3.0)
     wrench = jnp.einsum("nij,nj->ni", jg.world_grasp_map(grasp, state.orientation), force)
-    theirs, ours = jax.jit(plant.advance)(state, wrench), jg.advance(body, state, wrench, H, gravity)
+    theirs, ours = plant.advance(state, wrench), jg.advance(body, state, wrench, H, gravity)
     assert relative(tangent_difference(theirs, ours), np.zeros((N, 12))).max() < 1e-9
 
 
@@ -63,11 +63,12 @@ def derivatives(scene):
     _, grasp, force, _, _, plant = scene
     rest = jg.BodyState.at_rest(3, (N,))
     return (
-        jax.jit(plant.acceleration_derivatives)(rest, grasp, force),
-        jax.jit(plant.step_derivatives)(rest, grasp, force),
+        plant.acceleration_derivatives(rest, grasp, force),
+        plant.step_derivatives(rest, grasp, force),
     )
 
 
+@pytest.mark.slow
 def test_A_and_B_are_mujocos(scene, derivatives):
     """(11.29) against d qacc / d (tangent, f) on 1 000 bodies and grasps, 1e-6; the factor g included."""
     body, grasp, _, gravity, held, _ = scene
@@ -79,6 +80,7 @@ def test_A_and_B_are_mujocos(scene, derivatives):
     assert relative(0.9 * by_state, analytic)[held].min() > 1e-3  # the test can fail
 
 
+@pytest.mark.slow
 def test_mujocos_step_is_their_semi_implicit_image(scene, derivatives):
     """``[[I + h^2 A_c, h I], [h A_c, I]]`` and ``[h^2 B_c; h B_c]`` to 1e-6."""
     body, grasp, _, gravity, held, _ = scene
@@ -91,9 +93,24 @@ def test_mujocos_step_is_their_semi_implicit_image(scene, derivatives):
     assert relative(by_state, A)[held].max() < 1e-6
     B = jnp.concatenate([H**2 * B_c, H * B_c], axis=1)
     assert relative(by_force, B).max() < 1e-6
-    assert relative(by_state - jnp.eye(12), A - jnp.eye(12))[held].max() < 1e-6
 
 
+def test_mjx_alone_forgets_how_a_resting_body_starts_to_turn():
+    """Why the plant integrates rotations below 1e-8 rad/s itself. Fails when MJX no longer needs that."""
+    from jaxgrasp.simulation import _mjx
+
+    plant = jg.mujoco_plant(jg.RigidBody(1.0, np.eye(3)), H)
+
+    def turned_by(omega):
+        data = plant.template.replace(qvel=jnp.concatenate([jnp.zeros(3), omega]))
+        with jax.numpy_dtype_promotion("standard"):
+            return _mjx().step(plant.model, data).qpos[4:]
+
+    assert np.abs(jax.jacfwd(turned_by)(jnp.zeros(3))).max() == 0
+    np.testing.assert_allclose(jax.jacfwd(turned_by)(jnp.full(3, 1e-7)), H / 2 * np.eye(3), atol=1e-9)
+
+
+@pytest.mark.slow
 def test_derivatives_hold_in_motion_too(scene):
     """At any state, against automatic derivatives of the analytic acceleration in the same coordinates."""
     body, grasp, force, gravity, _, plant = scene
@@ -114,6 +131,7 @@ def test_derivatives_hold_in_motion_too(scene):
         assert relative(a, b).max() < 1e-8
 
 
+@pytest.mark.slow
 def test_reverse_mode_gives_the_same(scene):
     body, grasp, force, gravity, _, _ = scene
     one = jax.tree.map(lambda x: x[0], (body, grasp, force))
@@ -137,7 +155,7 @@ def test_rollouts_are_those_of_the_c_engine(scene):
     body, grasp, force = jax.tree.map(lambda x: x[chosen], (body, grasp, force))
     start = random_states(np.random.default_rng(4), len(chosen), 3, speed=2.0)
     plant = jg.mujoco_plant(body, H, gravity)
-    path = jax.jit(plant.roll_out)(start, grasp, jnp.broadcast_to(force, (100, *force.shape)))
+    path = plant.roll_out(start, grasp, jnp.broadcast_to(force, (100, *force.shape)))
     last = jax.tree.map(lambda x: x[-1], path)
 
     ours = start
