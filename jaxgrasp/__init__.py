@@ -4,7 +4,9 @@ Names follow the chapter "Wrench Resistant Grasps"; wrench resistance is what ot
 """
 
 from .certificate import check_certificate
+from .closed_loop import ClosedLoop, close_loop
 from .contacts import ContactModel, Frictionless, HardFinger, SoftFinger
+from .control import ComputedTorque, ControlStatus, Gains, Reference
 from .controllability import (
     Controllability,
     ControllabilityVerdict,
@@ -59,6 +61,7 @@ from .lmi import (
     second_order_cone_lmi,
 )
 from .lmi_forces import LMIForces, lmi_forces
+from .regulator import Regulator, regulator
 from .resistance import WrenchResistance, wrench_resistance
 from .simulation import MujocoPlant, mujoco_model, mujoco_plant
 from .solver import Stop
@@ -140,6 +143,14 @@ __all__ = [
     "mujoco_plant",
     "mujoco_model",
     "MujocoPlant",
+    "close_loop",
+    "ClosedLoop",
+    "ComputedTorque",
+    "Regulator",
+    "regulator",
+    "Gains",
+    "Reference",
+    "ControlStatus",
     # answers and their proofs
     "Status",
     "check_certificate",

@@ -237,6 +237,7 @@ class Scaled(NamedTuple):
     force: Float[Array, "*batch"]
 
 
+@eqx.filter_jit
 def scaled_system(grasp: Grasp, body: RigidBody, gravity: Any = None) -> Scaled:
     """The second-order system ``x'' = A_c x + B_c s`` in units of the body, for decisions that depend on no unit."""
     grasp, body = _spread(grasp, body)

@@ -65,6 +65,10 @@ FLOORS = [
     "linearization",
     "controllability",
     "simulation",
+    "admissible",
+    "control",
+    "regulator",
+    "closed_loop",
     # the roof
     "errors",
     "backend",
