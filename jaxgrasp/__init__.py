@@ -14,6 +14,7 @@ from .controllability import (
     controllability_matrix,
     gramian,
 )
+from .controllability_words import explain_controllability
 from .criteria import Criterion, Gentlest, LeastNorm, Robust, SmallestSum, SumOfSquares
 from .dynamics import (
     BodyState,
@@ -138,6 +139,7 @@ __all__ = [
     "controllability",
     "Controllability",
     "ControllabilityVerdict",
+    "explain_controllability",
     "controllability_matrix",
     "gramian",
     "mujoco_plant",

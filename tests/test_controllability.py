@@ -129,6 +129,27 @@ def test_the_uncontrollable_motion_is_the_one_to_picture(answers):
     assert np.abs(np.einsum("ni,nij->nj", xi, turning)).max() < 1e-9
 
 
+def test_the_reason_is_told_in_words(answers):
+    _, found = answers
+
+    def told(name):
+        return jg.explain_controllability(found, list(CASES).index(name), [0.1, 0, 0])
+
+    text = told("two hard, line through, horizontal")
+    assert "Not controllable to first order" in text and "rank 10 of 12" in text
+    assert "Out of reach: a rotation about the axis along (1, 0, 0) through the centre of mass." in text
+    text = told("two hard, line above")
+    assert (
+        "though not wrench resistant" in text
+        and "The fingers alone reach 5 of 6 directions, with gravity 6" in text
+    )
+    assert "times the weight" in text and "Out of reach" not in text
+    assert "they do not carry the weight" in told("from above")
+    assert "one of 3" in told("one hard finger from below") or "Out of reach:" in told(
+        "one hard finger from below"
+    )
+
+
 def test_without_gravity_nothing_helps_the_fingers(answers):
     grasp, found = answers
     weight = np.array([0, 0, -1.0, 0, 0, 0])

@@ -69,6 +69,8 @@ FLOORS = [
     "control",
     "regulator",
     "closed_loop",
+    "screws",
+    "controllability_words",
     # the roof
     "errors",
     "backend",
