@@ -111,7 +111,8 @@ def _run(setting: _Setting, state: BodyState, reference: Reference, pushes, step
         step, start, (reference if moving else None, pushes), length=steps
     )
     states, force = path if record else (None, None)
-    return ClosedLoop(*seen, final, states, force)
+    status, position, orientation, use, largest = seen
+    return ClosedLoop(status, position, orientation, use, largest, final, states, force)
 
 
 def _laid_out(reference: Reference, batch: tuple[int, ...], steps: int, dtype) -> tuple[Reference, bool]:

@@ -87,7 +87,7 @@ class Regulator(ContactController):
         return Command(jnp.where(bad[..., None], 0.0, force), said, asked)
 
 
-def _image(system: Scaled, timestep: float) -> tuple[Array, Array]:
+def _image(system: Scaled, timestep: Array) -> tuple[Array, Array]:
     """A and B of one semi-implicit Euler step, without units."""
     h = (timestep / system.time)[..., None, None]
     A_c, B_c = system.A_c, system.B_c

@@ -60,6 +60,7 @@ def mujoco_model(body: RigidBody, timestep: float = 0.002, gravity: Any = None, 
     """
     import mujoco
 
+    engine: Any = mujoco  # a compiled module without types
     _spatial(body)
     if body.batch_shape:
         raise ValueError(f"a MuJoCo model holds one body, this one has batch axes {body.batch_shape}")
@@ -79,7 +80,7 @@ def mujoco_model(body: RigidBody, timestep: float = 0.002, gravity: Any = None, 
         inertia=_words(inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]),
         geometry=GEOMETRY if mesh is not None else "",
     )
-    return mujoco.MjModel.from_xml_string(xml, assets)
+    return engine.MjModel.from_xml_string(xml, assets)
 
 
 def _spatial(body: RigidBody) -> None:

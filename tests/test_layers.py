@@ -90,9 +90,11 @@ FLOORS = [
     "loads",
     "loading",
     "force_report",
+    "checking",
     "",  # jaxgrasp/__init__.py, the table of contents
     "terminal",
     "cli_forces",
+    "cli_check",
     "cli",
     "__main__",
 ]
