@@ -453,6 +453,7 @@ PLANAR = {
 }
 
 
+@pytest.mark.slow
 def test_planar_cases():
     grasp = stacked(PLANAR.values(), 3, 2)
     force = carrying(grasp, np.array([0, -0.2 * 9.81, 0]))

@@ -95,6 +95,7 @@ def test_mujocos_step_is_their_semi_implicit_image(scene, derivatives):
     assert relative(by_force, B).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_mjx_alone_forgets_how_a_resting_body_starts_to_turn():
     """Why the plant integrates rotations below 1e-8 rad/s itself. Fails when MJX no longer needs that."""
     from jaxgrasp.simulation import _mjx
@@ -146,6 +147,7 @@ def test_reverse_mode_gives_the_same(scene):
     np.testing.assert_allclose(jax.grad(fallen)(one[2]) @ direction, forward, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_rollouts_are_those_of_the_c_engine(scene):
     """100 steps with forces that turn with the body, from a tumbling start, to 1e-6; MJX and the analytic step."""
     import mujoco
