@@ -4,8 +4,28 @@ Names follow the chapter "Wrench Resistant Grasps"; wrench resistance is what ot
 """
 
 from .certificate import check_certificate
+from .closed_loop import ClosedLoop, close_loop
 from .contacts import ContactModel, Frictionless, HardFinger, SoftFinger
+from .control import ComputedTorque, ControlStatus, Gains, Reference
+from .controllability import (
+    Controllability,
+    ControllabilityVerdict,
+    controllability,
+    controllability_matrix,
+    gramian,
+)
+from .controllability_words import explain_controllability
 from .criteria import Criterion, Gentlest, LeastNorm, Robust, SmallestSum, SumOfSquares
+from .dynamics import (
+    BodyState,
+    RigidBody,
+    acceleration,
+    advance,
+    coriolis,
+    gravity_term,
+    mass_matrix,
+    world_grasp_map,
+)
 from .equilibrium import (
     Equilibrium,
     EquilibriumKind,
@@ -25,6 +45,7 @@ from .grasp import (
     internal_force_part,
     null_space,
 )
+from .linearization import Linearization, OperatingPoint, linearize
 from .lmi import (
     FrictionLMI,
     LMIFeasibility,
@@ -41,7 +62,9 @@ from .lmi import (
     second_order_cone_lmi,
 )
 from .lmi_forces import LMIForces, lmi_forces
+from .regulator import Regulator, regulator
 from .resistance import WrenchResistance, wrench_resistance
+from .simulation import MujocoPlant, mujoco_model, mujoco_plant
 from .solver import Stop
 from .status import Status
 from .tracing import Trace, load_grasp, save_grasp, trace
@@ -101,6 +124,35 @@ __all__ = [
     "ResistibleWrenches",
     "lmi_forces",
     "LMIForces",
+    # 11.4 dynamics and controllability
+    "RigidBody",
+    "BodyState",
+    "mass_matrix",
+    "coriolis",
+    "gravity_term",
+    "world_grasp_map",
+    "acceleration",
+    "advance",
+    "linearize",
+    "Linearization",
+    "OperatingPoint",
+    "controllability",
+    "Controllability",
+    "ControllabilityVerdict",
+    "explain_controllability",
+    "controllability_matrix",
+    "gramian",
+    "mujoco_plant",
+    "mujoco_model",
+    "MujocoPlant",
+    "close_loop",
+    "ClosedLoop",
+    "ComputedTorque",
+    "Regulator",
+    "regulator",
+    "Gains",
+    "Reference",
+    "ControlStatus",
     # answers and their proofs
     "Status",
     "check_certificate",

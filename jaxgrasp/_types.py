@@ -15,6 +15,7 @@ __all__ = [
     "Float",
     "Int",
     "SpokenEnum",
+    "balance_tolerance",
     "complementary_ratio",
     "gap_floor",
     "largest_response",
@@ -101,3 +102,11 @@ def proven_limit(dtype) -> float:
     In float32 rounding of the twist itself takes a part of the difference.
     """
     return 2e6 if jnp.dtype(dtype).itemsize == 8 else 1e7
+
+
+def balance_tolerance(dtype) -> float:
+    """Given forces balance a load, or lie on the edge of their cones, to this share of their size: 1e-7 (float64).
+
+    Forces that a solver found to 1e-8, or that a person wrote down, still count as an equilibrium.
+    """
+    return 1e-7 if jnp.dtype(dtype).itemsize == 8 else 1e-4

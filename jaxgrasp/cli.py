@@ -1,4 +1,4 @@
-"""The command line: parse, call, print. ``jaxgrasp screen``, ``explain``, ``objects`` (``forces``: ``cli_forces``)."""
+"""The command line: parse, call, print. ``jaxgrasp screen``, ``explain``, ``objects`` (others: ``cli_*``)."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from .cli_check import CHECK_HELP, check
 from .cli_forces import FORCES_HELP, explain_forces, forces
 from .errors import UserError
 from .terminal import ProgressBar, counts, numbers, quantiles, say, speed
@@ -170,6 +171,7 @@ def _print_summary(summary, run) -> None:
 
 
 app.command(help=FORCES_HELP)(forces)
+app.command(help=CHECK_HELP)(check)
 
 
 @app.command(help=EXPLAIN_HELP)

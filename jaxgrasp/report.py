@@ -1,8 +1,6 @@
 """One grasp's verdict in words, and as a picture.
 
-An escape twist (v; omega) at the centre of mass c is a screw: the line through ``c + omega x v /
-|omega|^2`` along omega, with pitch ``omega . v / |omega|^2`` metres a radian; with omega = 0 it is a slide
-along v.
+An escape twist (v; omega) is told as the screw it is (``screws``).
 """
 
 from __future__ import annotations
@@ -20,6 +18,7 @@ from .certificate import check_certificate
 from .errors import UserError
 from .grasp import Grasp
 from .run import MODELS
+from .screws import Screw, screw, vector
 from .status import Status
 
 if TYPE_CHECKING:
@@ -28,23 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["Screw", "Verdict", "draw", "explain", "reprove", "screw"]
 
 SMALL = 1e-6  # a part of a twist below this share of the whole counts as zero
-SLIGHT = 0.02  # a screw that advances less than this share of the object's size a radian is called a rotation
 COMPONENTS = {"frictionless": ("f_n",), "hard": ("f_x", "f_y", "f_n"), "soft": ("f_x", "f_y", "f_n", "tau_n")}
-
-
-@dataclass(frozen=True)
-class Screw:
-    """A twist as a motion: ``kind`` is "rotation", "slide" or "screw".
-
-    direction  unit vector: of the axis, or of the slide
-    point      the axis' nearest point to the centre of mass, m, mesh frame; None for a slide
-    pitch      m a radian; small or 0 for a rotation, infinite for a slide
-    """
-
-    kind: str
-    direction: np.ndarray
-    point: np.ndarray | None
-    pitch: float
 
 
 @dataclass(frozen=True)
@@ -100,29 +83,13 @@ class Verdict:
         return float(distance.max()) if len(distance) and np.isfinite(distance).all() else 1.0
 
 
-def screw(twist: np.ndarray, centre_of_mass: np.ndarray, size: float) -> Screw:
-    """The motion that ``twist`` (v; omega) at the centre of mass is; ``size`` in m weighs omega against v."""
-    v, omega = twist[:3], twist[3:]
-    turning, sliding = size * np.linalg.norm(omega), np.linalg.norm(v)
-    if turning <= SMALL * sliding:
-        return Screw("slide", v / sliding, None, float("inf"))
-    rate = float(omega @ omega)
-    point, pitch = centre_of_mass + np.cross(omega, v) / rate, float(omega @ v) / rate
-    kind = "rotation" if abs(pitch) <= SLIGHT * size else "screw"
-    return Screw(kind, omega / np.sqrt(rate), point, 0.0 if abs(pitch) <= SMALL * size else pitch)
-
-
-def _vector(x: np.ndarray) -> str:
-    return "(" + ", ".join(f"{v + 0.0:.4g}" if abs(v) > 5e-7 else "0" for v in x) + ")"
-
-
 def _escape(verdict: Verdict) -> list[str]:
     assert verdict.twist is not None
     motion = screw(verdict.twist, verdict.centre_of_mass, verdict.size)
     if motion.kind == "slide" or motion.point is None:
-        text = f"a slide along {_vector(motion.direction)}"
+        text = f"a slide along {vector(motion.direction)}"
     else:
-        where = f"the axis along {_vector(motion.direction)} through {_vector(motion.point)} m"
+        where = f"the axis along {vector(motion.direction)} through {vector(motion.point)} m"
         text = f"a rotation about {where}"
         if motion.pitch:
             text += f", advancing {1000 * motion.pitch * np.pi / 180:.3g} mm along it with each degree"

@@ -101,6 +101,11 @@ def test_the_forces_example_prints_what_is_shown(tmp_path):
     same_words(block("forces example output"), printed)
 
 
+@pytest.mark.slow
+def test_the_motion_example_prints_what_is_shown(tmp_path):
+    same_words(block("motion example output"), run("-c", block("motion example"), cwd=tmp_path))
+
+
 def test_explain_prints_what_is_shown(tmp_path):
     """A row depends on the seed and its number alone, so 300 samples hold the README's rows."""
     action = block("main command").split(" && ")[1].split()
