@@ -223,23 +223,34 @@ def _gained(gain: Array, v: Array) -> Array:
 class ComputedTorque(ContactController):
     """(11.27) with optimal contact forces: for grasps that can produce every wrench they need.
 
-    gains       ``Gains``; criterion: which of all admissible forces (default ``SumOfSquares()``)
-    max_normal  N, a number or one per contact; None: no limit
-    tolerance   of the optimisation: how nearly optimal the forces are. How nearly they produce the wrench is checked
-                apart, and in their cones they always are
+    gains          ``Gains``; criterion: which of all admissible forces (default ``SumOfSquares()``)
+    max_normal     N, a number or one per contact; None: no limit
+    torque_limits  (J, tau_max) as for ``optimize_forces``: ``|J^T f| <= tau_max``, J fixed to the object; None: none
+    tolerance      of the optimisation: how nearly optimal the forces are. How nearly they produce the wrench is checked
+                   apart, and in their cones they always are
     """
 
     gains: Gains
     criterion: Criterion
     max_normal: Array | None
+    torque_limits: tuple[Array, Array] | None
     tolerance: float = eqx.field(static=True)
 
     def __init__(
-        self, gains: Gains, criterion: Criterion | None = None, max_normal: Any = None, tolerance=1e-6
+        self,
+        gains: Gains,
+        criterion: Criterion | None = None,
+        max_normal: Any = None,
+        torque_limits: tuple[Any, Any] | None = None,
+        tolerance: float = 1e-6,
     ):
         self.gains = gains
         self.criterion = SumOfSquares() if criterion is None else criterion
         self.max_normal = None if max_normal is None else jnp.asarray(max_normal, float)
+        self.torque_limits = None
+        if torque_limits is not None:
+            jacobian, largest = torque_limits
+            self.torque_limits = (jnp.asarray(jacobian, float), jnp.asarray(largest, float))
         self.tolerance = tolerance
 
     def check(self, timestep: float, dimension: int) -> None:
@@ -277,7 +288,9 @@ class ComputedTorque(ContactController):
             ],
             axis=-1,
         )
-        found = optimize_forces(grasp, -asked, self.criterion, self.max_normal, tolerance=self.tolerance)
+        found = optimize_forces(
+            grasp, -asked, self.criterion, self.max_normal, self.torque_limits, tolerance=self.tolerance
+        )
         cap = None if self.max_normal is None else self.max_normal.astype(asked.dtype)
         force = into_cones(grasp, found.force, cap)
         made = jnp.sum(grasp_map(grasp) * force[..., None, :], axis=-1)

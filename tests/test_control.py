@@ -110,6 +110,27 @@ def test_limits_of_the_fingers_are_kept_and_their_lack_reported():
     assert (np.asarray(out.largest_normal) <= limit[:, 0] + 1e-12).all()
 
 
+@pytest.mark.slow
+def test_joint_torques_stay_under_their_limits():
+    """One joint presses both opposite fingers: half a newton of torque limit is what they may press together."""
+    grasp = ring()
+    J = np.zeros((6, 1))
+    index = grasp.model.normal_index(2)
+    J[[index, 2 + index], 0] = 1.0
+    hold = jg.Reference.hold(jg.BodyState.at_rest(2))
+    start = rested(np.tile([0.002, 0.001, 0.05], (LANES, 1)))
+    kinds = []
+    for largest in (20.0, 0.5):
+        controller = jg.ComputedTorque(jg.Gains.of_rate(10.0), torque_limits=(J, np.array([largest])))
+        out = jg.close_loop(grasp, PLANAR, controller, start, 200, 0.002, hold, record=True)
+        torque = np.asarray(out.force) @ J
+        assert np.abs(torque).max() <= largest * (1 + 1e-9)
+        assert slack(grasp, out.force) > -1e-9
+        kinds.append(set(np.unique(out.status).tolist()))
+    assert kinds[0] == {C.COMMANDED.value}
+    assert C.INFEASIBLE.value in kinds[1]
+
+
 def test_a_disturbed_grasp_recovers_and_settling_is_counted():
     push = np.zeros((STEPS, 3))
     push[50:60] = [1.0, 2.0, 0.01]

@@ -440,3 +440,38 @@ def test_orthonormal_rows_reproduce_the_matrix(m, dtype):
     )
     kept = np.delete(np.arange(8), [1, 2])
     np.testing.assert_allclose(np.einsum("jil,jl->il", L, twist)[:, kept], y[:, kept], atol=1e4 * eps)
+
+
+def test_packing_gives_back_what_it_took():
+    rows = {
+        "a": jnp.arange(12.0).reshape(3, 2, 2),
+        "none": jnp.zeros((3, 0)),
+        "flag": jnp.array([True, False, True]),
+        "count": jnp.array([1, 2, 3], jnp.int32),
+        "b": jnp.arange(3.0),
+    }
+    packing = lanes.Packing(rows)
+    packed = packing.pack(rows)
+    assert {name: x.shape for name, x in packed.items()} == {
+        "bool": (3, 1),
+        "int32": (3, 1),
+        rows["a"].dtype.name: (3, 5),
+    }
+    back = packing.unpack(packed)
+    for name, x in rows.items():
+        np.testing.assert_array_equal(back[name], x)
+        assert back[name].dtype == x.dtype and back[name].shape == x.shape
+
+
+def test_sweeps_return_to_what_is_unfinished_and_to_nothing_else():
+    """Each row counts down to zero, two a sweep; rows beyond the count stay zero."""
+    rows = jnp.array([1, 2, 3, 4, 5, 6, 7, 8], jnp.int32)
+    shapes = {"left": rows, "sweeps": rows}
+
+    def kernel(start, out, sweep):
+        left = jnp.where(sweep == 0, start, out["left"])
+        return {"left": jnp.maximum(left - 2, 0), "sweeps": out["sweeps"] + 1}
+
+    out = lanes.in_sweeps(kernel, rows, shapes, lambda out: out["left"] > 0, jnp.int32(7), 3, 4)
+    np.testing.assert_array_equal(out["left"], [0, 0, 0, 0, 0, 0, 1, 0])
+    np.testing.assert_array_equal(out["sweeps"], [1, 1, 2, 2, 3, 3, 3, 0])
