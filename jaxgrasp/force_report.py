@@ -252,6 +252,7 @@ def reprove(answer: ForceAnswer) -> bool:
             escape_twist=nothing if answer.escape_twist is None else jnp.asarray(answer.escape_twist),
             load_twist=nothing if answer.load_twist is None else jnp.asarray(answer.load_twist),
             joint_rates=jnp.zeros(0),
+            smooth=jnp.asarray(False),  # not stored, and no part of the proof
             iterations=jnp.int32(0),
             stop=jnp.int32(0),
             wrench=jnp.asarray(answer.wrench),

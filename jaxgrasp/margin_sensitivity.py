@@ -25,8 +25,9 @@ from .lanes import to_lanes, to_rows
 from .margin import Contacts, fold, margin_program
 from .solver import Stop
 from .solver.convex import Bounds, ConvexProgram, Point
-from .solver.implicit import Motion, lagrangian, newton_solve, point_tangent, residuals
+from .solver.implicit import lagrangian, point_tangent, residuals
 from .solver.linear import Cholesky
+from .solver.newton_matrix import Motion, newton_solve
 from .solver.stages import inlined, kernel
 from .tangents import in_tiles, kept, masked, safe_contacts, zero_tangent
 from .verdict import Verdict, unfold

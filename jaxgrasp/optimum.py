@@ -133,7 +133,10 @@ def answer(
     m = program.rhs.shape[0]
     u = _polished(projection.basis.columns, program.rhs, program.exists, point.u)
     weight = demand.criterion.barrier_weight
-    terms = None if demand.log_det is None else tuple(to_lanes(x) for x in demand.log_det)
+    terms = None
+    if demand.log_det is not None:
+        on_normal, on_cone, constant = (to_lanes(x) for x in demand.log_det)
+        terms = (on_normal, on_cone, constant)
     cost = criterion_value(program, u, load.size, weight, terms)
 
     rows = _all_rows(point)

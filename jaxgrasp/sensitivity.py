@@ -30,8 +30,9 @@ from .margin import Contacts, fold
 from .optimum import Answer
 from .solver import Stop
 from .solver.convex import ConvexProgram, Point
-from .solver.implicit import Motion, lagrangian, newton_solve, point_tangent, residuals
+from .solver.implicit import lagrangian, point_tangent, residuals
 from .solver.linear import Cholesky
+from .solver.newton_matrix import Motion, newton_solve
 from .solver.stages import inlined, kernel
 from .status import Status
 from .tangents import in_tiles, kept, masked, safe_contacts, zero_tangent

@@ -36,6 +36,7 @@ FLOORS = [
     "solver.steps",
     "solver.newton",
     "solver.primal_dual",
+    "solver.newton_matrix",
     "solver.implicit",
     "solver.regularity",
     "solver",

@@ -1,7 +1,7 @@
 """Whether a solved ``ConvexProgram`` has one solution that moves smoothly with its data.
 
     strictly complementary: of each pair of eigenvalues of u and z, and of each slack and its price, one is positive
-    unique:                 the Newton matrix of ``implicit`` is regular at the solution, for u and for multipliers
+    unique:                 the Newton matrix is regular at the solution, for u and for multipliers
 
 Then solution and multipliers are differentiable (Fiacco 1983, theorem 2.4.1). On the central path a pair that
 should be (positive, 0) is (a, mu / a), and one that is (0, 0) has two members of size sqrt(mu): the ratio tells. A
@@ -16,9 +16,9 @@ from .._types import Array, complementary_ratio, largest_response
 from ..cones import Cone, cone_max
 from .blocks import Frame
 from .convex import Bounds, ConvexProgram, Optional, Point
-from .implicit import newton_at
 from .kkt import factor
 from .linear import vector_norm
+from .newton_matrix import newton_at
 from .stages import stage
 
 __all__ = ["regular"]
