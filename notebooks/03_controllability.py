@@ -5,6 +5,8 @@
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -188,6 +190,7 @@ for axes, label in zip(
     panels, ("position error (mm)", "largest normal force (N)", "friction used"), strict=True
 ):
     axes.set(xlabel="time (s)", ylabel=label)
+panels[2].set_ylim(0, 1.05)
 plt.show()
 status = {jg.ControlStatus(int(s)).name for s in np.unique(out.status)}
 print("every step:", status)
