@@ -26,6 +26,7 @@ from .steps import cone_reach, in_frame, rejoined
 __all__ = ["Step", "measure", "newton_step"]
 
 LONGEST_FRACTION, SHORTEST_FRACTION = 0.999, 0.9  # of the way to the boundary
+AIM = 0.5  # of the gap to reach: no step aims lower, because a nearer central point is reached by a full step
 SMALL_RESIDUAL = 0.1  # of a product: the step that removes it then leaves the products as they are
 
 
@@ -213,19 +214,15 @@ class Aim(NamedTuple):
 
 @stage
 def _aim(
-    before: Array,
-    after: Array,
-    count: Array,
-    closed: Array,
-    centred: Array,
-    infeasibility: Array,
+    before: Array, after: Array, count: Array, goal: Array, closed: Array, centred: Array, infeasibility: Array,
     weight: Array,
-) -> Aim:
-    """Mehrotra's ``sigma = ratio^3``. In ``closed`` lanes sigma = 1, until the point is centred and what is left of the
-    residuals is small next to a product; then the residuals alone."""
+) -> Aim:  # fmt: skip
+    """Mehrotra's ``sigma = ratio^3``, but aiming no lower than ``AIM goal``. In ``closed`` lanes sigma = 1, until the
+    point is centred and what is left of the residuals is small next to a product; then the residuals alone."""
     zero, one = jnp.zeros_like(after), jnp.ones_like(after)
     ratio = jnp.where(closed, one, jnp.minimum(jnp.maximum(after / before, zero), one))
-    sigma = ratio * ratio * ratio
+    lowest = jnp.minimum(jnp.asarray(AIM, goal.dtype) * goal / before, one)
+    sigma = jnp.where(closed, one, jnp.maximum(ratio * ratio * ratio, lowest))
     mu = sigma * before / count
     drive = jnp.where(closed & centred & (infeasibility <= SMALL_RESIDUAL * mu), zero, one)
     fraction = jnp.maximum(
@@ -242,8 +239,9 @@ def _length(reach: Array, fraction: Array) -> Array:
 
 
 def newton_step(
-    program: ConvexProgram, point: Point, excess: Array, infeasibility: Array, closed: Array, centred: Array
-) -> tuple[Point, Step]:
+    program: ConvexProgram, point: Point, excess: Array, infeasibility: Array, goal: Array, closed: Array,
+    centred: Array,
+) -> tuple[Point, Step]:  # fmt: skip
     """One predictor-corrector step. Lanes in ``closed`` keep the size of their products, centre, and mend residuals."""
     scaling = nesterov_todd(point.u, point.z)
     frame, lam = _frame(scaling.w, scaling.eta, point.z)
@@ -267,6 +265,6 @@ def newton_step(
     after, count = measure(program, ahead.u, ahead.z, ahead.slack, ahead.price)
     # Far from a fixed barrier's floor the full second-order correction overshoots.
     weight = one if program.cone_floor is None and program.smoothing is None else length
-    aim = _aim(excess, after, count, closed, centred, infeasibility, weight)
+    aim = _aim(excess, after, count, goal, closed, centred, infeasibility, weight)
     step, reach = direction(aim.mu, aim.share, aim.drive, aim.weight, affine)
     return _moved(point, step, _length(reach, aim.fraction)), step

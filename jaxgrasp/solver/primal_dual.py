@@ -109,6 +109,11 @@ def _size(program: ConvexProgram, point: Point) -> Array:
     return program.size(point)
 
 
+@stage
+def _goal(size: Array, tolerance: Array) -> Array:
+    return tolerance * size
+
+
 def closed(program: ConvexProgram, state: State, tolerance: Array) -> Array:
     """Whether the gap is small enough, and what is left is to meet the constraints to rounding."""
     return _closed(_size(program, state.point), state.excess, state.infeasibility, tolerance)
@@ -145,8 +150,9 @@ def advance(program: ConvexProgram, state: State, tolerance: Array, proves: Answ
     """One iteration of every running lane."""
     was_close = closed(program, state, tolerance)
     moved, step = newton_step(
-        program, state.point, state.excess, state.infeasibility, was_close, state.centred
-    )
+        program, state.point, state.excess, state.infeasibility, _goal(_size(program, state.point), tolerance),
+        was_close, state.centred,
+    )  # fmt: skip
     primal, dual, largest = _room(program, moved)
     point = _select(_running_and(state.stop, primal, dual), moved, state.point)
     excess, _ = measure(program, point.u, point.z, point.slack, point.price)
