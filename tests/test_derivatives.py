@@ -107,7 +107,7 @@ CASES = {
         with_weight(soft_problem, "length", 0.4),
     ),
 }
-FAST = ("margin, planar", "gentlest, planar with limits", "least norm, soft")
+FAST = ("margin, planar", "gentlest, planar with limits")
 MARKED = [pytest.param(n, marks=() if n in FAST else pytest.mark.slow) for n in CASES]
 
 

@@ -47,7 +47,7 @@ def closed_form(criterion, k):
 
 
 LIFTED = [
-    pytest.param(c, id=type(c).__name__, marks=[pytest.mark.f32] * (i in (0, 4)))
+    pytest.param(c, id=type(c).__name__, marks=pytest.mark.f32 if i in (0, 4) else pytest.mark.slow)
     for i, c in enumerate(CRITERIA)
 ]
 

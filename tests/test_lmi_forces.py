@@ -55,7 +55,7 @@ def test_limits_bind_at_their_bound_and_forbid_beyond_it(dtype):
     ("name", "limits", "criterion"),
     [
         ("planar hard", True, "robust"),
-        ("hard", False, "sum of squares"),
+        pytest.param("hard", False, "sum of squares", marks=pytest.mark.slow),
         pytest.param("frictionless", False, "gentlest", marks=pytest.mark.slow),
         pytest.param("hard", False, "gentlest", marks=pytest.mark.slow),
         pytest.param("planar hard", True, "smallest sum", marks=pytest.mark.slow),
