@@ -80,7 +80,8 @@ def test_ci_runs_the_readmes_command(name):
 def test_ci_uses_the_extracted_commands_unchanged():
     script = CI.read_text(encoding="utf-8")
     assert script.count('"$test_command"\n') == 1  # on Python 3.11
-    assert '"${test_command%%&&*}"' in script  # on the newest other Python, with the files that meet its interfaces
+    # On the newest other Python: its install, then the files that meet that Python's interfaces.
+    assert '"${test_command%%&&*}"' in script
     assert '"${main_command%%&&*}"' in script
     assert "${main_command#*&& }" in script
     assert os.access(CI, os.X_OK)
