@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -27,9 +28,8 @@ from .solver import Stop
 from .solver.convex import Bounds, ConvexProgram, Point
 from .solver.implicit import lagrangian, point_tangent, residuals
 from .solver.linear import Cholesky
-from .solver.newton_matrix import Motion, newton_solve
-from .solver.stages import inlined, kernel
-from .tangents import in_tiles, kept, masked, safe_contacts, zero_tangent
+from .solver.stages import inlined
+from .tangents import kept, masked, safe_contacts, tiled_solver, zero_tangent
 from .verdict import Verdict, unfold
 
 __all__ = ["Solved", "differentiable"]
@@ -79,25 +79,6 @@ def _internal_force(
     return unfold(s, components, to_lanes(contacts.friction), to_lanes(contacts.torsion))
 
 
-def _solver(form: _Form, contacts: Contacts, scales: Scales, point: Point) -> Callable[[Motion], Motion]:
-    """``newton_solve`` at these points, tile by tile; lanes last outside."""
-
-    @kernel
-    def run(contacts: Contacts, scales: Scales, point: Point, rhs: Motion) -> Motion:
-        scales, point, rhs = jax.tree.map(to_lanes, (scales, point, rhs))
-        program = _program(form, contacts, scales)
-        return jax.tree.map(to_rows, newton_solve(program, point, scales.factor, rhs))
-
-    solve = in_tiles(lambda tile: run(*tile), form.width)
-
-    def solved(rhs: Motion) -> Motion:
-        given = jax.tree.map(to_rows, (scales, point, rhs))
-        with inlined(False):
-            return jax.tree.map(to_lanes, solve((contacts, *given)))
-
-    return solved
-
-
 def differentiable(
     solve: Callable[[Contacts, Array], Solved], components: tuple[Component, ...], exact: bool, width: int
 ) -> Callable[[Contacts, Array], Solved]:
@@ -143,7 +124,8 @@ def _tangents(form: _Form, result: Solved, contacts: Contacts, change: Any) -> S
     scales = jax.tree.map(lambda x: lax.stop_gradient(to_lanes(kept(ok, flat(x), 1.0))), result.scales)
     program = _program(form, data, scales)
     _, residual = jax.jvp(lambda c: residuals(_program(form, c, scales), point), (data,), (changes,))
-    solver = _solver(form, *lax.stop_gradient((data, scales, point)))
+    fixed = lax.stop_gradient((data, scales, point))
+    solver = tiled_solver(partial(_program, form), *fixed, form.width)
     moved = point_tangent(program, point, residual, solver)
     _, cost = jax.jvp(lambda c: lagrangian(_program(form, c, scales), point), (data,), (changes,))
     t = 1 - cone_sum(program.price * point.u[0])

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -32,10 +33,9 @@ from .solver import Stop
 from .solver.convex import ConvexProgram, Point
 from .solver.implicit import lagrangian, point_tangent, residuals
 from .solver.linear import Cholesky
-from .solver.newton_matrix import Motion, newton_solve
-from .solver.stages import inlined, kernel
+from .solver.stages import inlined
 from .status import Status
-from .tangents import in_tiles, kept, masked, safe_contacts, zero_tangent
+from .tangents import kept, masked, safe_contacts, tiled_solver, zero_tangent
 from .verdict import unfold
 
 __all__ = ["Scales", "Solved", "differentiable"]
@@ -163,25 +163,6 @@ def _value(form: _Form, rows: Rows, scales: Scales, point: Point) -> Array:
     return total
 
 
-def _solver(form: _Form, rows: Rows, scales: Scales, point: Point) -> Callable[[Motion], Motion]:
-    """``newton_solve`` at these points, tile by tile; lanes last outside."""
-
-    @kernel
-    def run(rows: Rows, scales: Scales, point: Point, rhs: Motion) -> Motion:
-        scales, point, rhs = jax.tree.map(to_lanes, (scales, point, rhs))
-        program = _program(form, rows, scales)
-        return jax.tree.map(to_rows, newton_solve(program, point, scales.factor, rhs))
-
-    solve = in_tiles(lambda tile: run(*tile), form.width)
-
-    def solved(rhs: Motion) -> Motion:
-        given = jax.tree.map(to_rows, (scales, point, rhs))
-        with inlined(False):
-            return jax.tree.map(to_lanes, solve((rows, *given)))
-
-    return solved
-
-
 def differentiable(
     solve: Callable[[Rows, Array], Solved], components: tuple[Component, ...], dimension: int, width: int
 ) -> Callable[[Rows, Array], Solved]:
@@ -224,7 +205,7 @@ def _tangents(form: _Form, result: Solved, rows: Rows, change: Rows) -> Solved:
     program = _program(form, data, scales)
     _, residual = jax.jvp(lambda r: residuals(_program(form, r, scales), point), (data,), (changes,))
     fixed = lax.stop_gradient((data, scales, point))
-    moved = point_tangent(program, point, residual, _solver(form, *fixed))
+    moved = point_tangent(program, point, residual, tiled_solver(partial(_program, form), *fixed, form.width))
     _, seen = jax.jvp(lambda r, p: _view(form, r, scales, p), (data, point), (changes, moved))
     cost = seen.cost
     if data[1].smoothing is None:

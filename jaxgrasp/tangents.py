@@ -10,10 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._types import Array
-from .lanes import batched, map_tiles
+from .lanes import batched, map_tiles, to_lanes, to_rows
 from .margin import Contacts
+from .solver.convex import ConvexProgram, Point
+from .solver.newton_matrix import Motion, newton_solve
+from .solver.stages import inlined, kernel
 
-__all__ = ["in_tiles", "kept", "masked", "safe_contacts", "zero_tangent"]
+__all__ = ["kept", "masked", "safe_contacts", "tiled_solver", "zero_tangent"]
 
 
 def zero_tangent(x: Array) -> Any:
@@ -51,11 +54,29 @@ def safe_contacts(ok: Array, contacts: Contacts) -> Contacts:
     )
 
 
-def in_tiles(kernel: Callable[[Any], Any], width: int) -> Callable[[Any], Any]:
-    """``kernel`` on rows, a tile of ``width`` at a time; ``vmap`` adds rows. Their first leaf is (N, k, .)."""
+def tiled_solver(
+    program_of: Callable[[Any, Any], ConvexProgram], rows: Any, scales: Any, point: Point, width: int
+) -> Callable[[Motion], Motion]:
+    """``newton_solve`` at these points, a tile of ``width`` at a time; ``vmap`` adds rows. Lanes last outside.
 
-    def run(rows: Any, count: Array, _: Array) -> Any:
-        return map_tiles(kernel, rows, count, width)
+    ``program_of(rows, scales)`` is the program of A itself; the first leaf of ``rows`` is (N, k, .), and
+    ``scales.factor`` is the factor of A.
+    """
 
-    folded = batched(run, lambda rows: jax.tree.leaves(rows)[0].shape[:-2], width)
-    return lambda rows: folded(rows, jnp.zeros((), jnp.int32))
+    @kernel
+    def run(rows: Any, scales: Any, point: Point, rhs: Motion) -> Motion:
+        scales, point, rhs = jax.tree.map(to_lanes, (scales, point, rhs))
+        program = program_of(rows, scales)
+        return jax.tree.map(to_rows, newton_solve(program, point, scales.factor, rhs))
+
+    def in_tiles(given: Any, count: Array, _: Array) -> Any:
+        return map_tiles(lambda tile: run(*tile), given, count, width)
+
+    solve = batched(in_tiles, lambda given: jax.tree.leaves(given)[0].shape[:-2], width)
+
+    def solved(rhs: Motion) -> Motion:
+        given = jax.tree.map(to_rows, (scales, point, rhs))
+        with inlined(False):
+            return jax.tree.map(to_lanes, solve((rows, *given), jnp.zeros((), jnp.int32)))
+
+    return solved

@@ -57,10 +57,14 @@ class Frame(NamedTuple):
             ),
         )
 
+    def eigenvalues(self) -> Cone:
+        """Of W, one for each frame coordinate."""
+        across = [self.across] * (len(self.basis) - 1)
+        return tuple(w for w in (self.along, self.against, *across) if w is not None)
+
     def scale(self, x: Cone) -> Cone:
         """``W x`` in frame coordinates."""
-        factors: list = [self.along, self.against, *([self.across] * (len(x) - 2))]
-        return tuple(f * a for f, a in zip(factors[: len(x)], x, strict=True))
+        return tuple(f * a for f, a in zip(self.eigenvalues(), x, strict=True))
 
     def head_of_unscaled(self, x: Cone) -> Array:
         """The head of ``W^-1 x``, x in frame coordinates."""

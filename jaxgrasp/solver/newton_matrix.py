@@ -88,9 +88,7 @@ def newton_at(program: ConvexProgram, point: Point) -> Newton:
     """The Newton matrix at a point on the central path."""
     frame = central_frame(program, point)
     rates = families(lambda m, s, p: m * p / s, program.masks(), point.slack, point.price)
-    across = [frame.across] * (len(point.u) - 2)
-    eigenvalues = [w for w in (frame.along, frame.against, *across) if w is not None]
-    return Newton(program, rates, frame, tuple(1 / (w * w) for w in eigenvalues))
+    return Newton(program, rates, frame, tuple(1 / (w * w) for w in frame.eigenvalues()))
 
 
 def newton_product(newton: Newton, x: Motion) -> Motion:
@@ -211,8 +209,7 @@ def _left(newton: Newton, cut: Frame, change: Motion, x: Motion, rhs: Motion) ->
     ``rhs - N x`` itself would be noise: rates grow like 1 / gap, and multiply the rounding of u.
     """
     along = cut.to_frame(change.u)
-    eigenvalues = [w for w in (cut.along, cut.against, *[cut.across] * (len(along) - 2)) if w is not None]
-    excess = (1 / (w * w) - h for w, h in zip(eigenvalues, newton.stiffness, strict=True))
+    excess = (1 / (w * w) - h for w, h in zip(cut.eigenvalues(), newton.stiffness, strict=True))
     cone = cut.from_frame(tuple(h * a for h, a in zip(excess, along, strict=True)))
     m = rhs.y.shape[0]
     applied = matvec(tuple(c[:m] for c in newton.program.columns), x.u)

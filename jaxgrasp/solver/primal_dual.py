@@ -100,23 +100,15 @@ def _select(taken: Array, new: Point, old: Point) -> Point:
 
 
 @stage
-def _closed(size: Array, excess: Array, infeasibility: Array, tolerance: Array) -> Array:
-    return (excess <= tolerance * size) & (infeasibility <= ALMOST)
-
-
-@stage
-def _size(program: ConvexProgram, point: Point) -> Array:
-    return program.size(point)
-
-
-@stage
-def _goal(size: Array, tolerance: Array) -> Array:
-    return tolerance * size
-
-
-def closed(program: ConvexProgram, state: State, tolerance: Array) -> Array:
+def _closed(goal: Array, excess: Array, infeasibility: Array) -> Array:
     """Whether the gap is small enough, and what is left is to meet the constraints to rounding."""
-    return _closed(_size(program, state.point), state.excess, state.infeasibility, tolerance)
+    return (excess <= goal) & (infeasibility <= ALMOST)
+
+
+@stage
+def _goal(program: ConvexProgram, point: Point, tolerance: Array) -> Array:
+    """The gap to reach (L,)."""
+    return tolerance * program.size(point)
 
 
 @stage
@@ -148,18 +140,16 @@ def _judged(
 
 def advance(program: ConvexProgram, state: State, tolerance: Array, proves: Answered, fine: float) -> State:
     """One iteration of every running lane."""
-    was_close = closed(program, state, tolerance)
+    goal = _goal(program, state.point, tolerance)
+    was_close = _closed(goal, state.excess, state.infeasibility)
     moved, step = newton_step(
-        program, state.point, state.excess, state.infeasibility, _goal(_size(program, state.point), tolerance),
-        was_close, state.centred,
-    )  # fmt: skip
+        program, state.point, state.excess, state.infeasibility, goal, was_close, state.centred
+    )
     primal, dual, largest = _room(program, moved)
     point = _select(_running_and(state.stop, primal, dual), moved, state.point)
     excess, _ = measure(program, point.u, point.z, point.slack, point.price)
     infeasibility = _infeasibility(program, point)
-    close = closed(
-        program, state._replace(point=point, excess=excess, infeasibility=infeasibility), tolerance
-    )
+    close = _closed(_goal(program, point, tolerance), excess, infeasibility)
     rows, centred = _rows(point), _centred(program, point)
     return _judged(
         state, point, excess, infeasibility, centred, primal, dual, close, was_close, proves(program, rows),
