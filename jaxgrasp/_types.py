@@ -17,12 +17,15 @@ __all__ = [
     "SpokenEnum",
     "balance_tolerance",
     "complementary_ratio",
+    "edge_tolerance",
     "gap_floor",
     "largest_response",
     "pivot_tolerance",
     "rank_tolerance",
     "rounding_constant",
+    "stationary_tolerance",
     "unit_roundoff",
+    "visibility_tolerance",
     "widest_scaling",
 ]
 
@@ -86,6 +89,27 @@ def complementary_ratio(dtype) -> float:
 def largest_response(dtype) -> float:
     """Forces that answer a change of size 1 by more than this are not unique: 1e5 (float64), 1e3 (float32)."""
     return 1e5 if jnp.dtype(dtype).itemsize == 8 else 1e3
+
+
+def edge_tolerance(dtype) -> float:
+    """Optimal forces may lie outside their cones and limits by this share of the largest: 128 eps.
+
+    Half of what the checker accepts. Forces that have no choice, on the edge of friction, are known to about 100 eps.
+    """
+    return 128 * unit_roundoff(dtype)
+
+
+def stationary_tolerance(dtype) -> float:
+    """Newton's method for the weakest direction has arrived at this residual: 1e-9 (float64), 1e-4 (float32)."""
+    return 1e-9 if jnp.dtype(dtype).itemsize == 8 else 1e-4
+
+
+def visibility_tolerance(dtype) -> float:
+    """A vertex lies outside a facet from this share of the facet's distance on: 1e-9 (float64), 1e-4 (float32).
+
+    The discs of a friction cone fill facets exactly; what rounding lifts off them must not split them.
+    """
+    return 1e-9 if jnp.dtype(dtype).itemsize == 8 else 1e-4
 
 
 def rounding_constant() -> float:

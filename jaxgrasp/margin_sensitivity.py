@@ -26,7 +26,7 @@ from .lanes import to_lanes, to_rows
 from .margin import Contacts, fold, margin_program
 from .solver import Stop
 from .solver.convex import Bounds, ConvexProgram, Point
-from .solver.implicit import lagrangian, point_tangent, residuals
+from .solver.implicit import centred, lagrangian, point_tangent, residuals
 from .solver.linear import Cholesky
 from .solver.stages import inlined
 from .tangents import kept, masked, safe_contacts, tiled_solver, zero_tangent
@@ -34,6 +34,7 @@ from .verdict import Verdict, unfold
 
 __all__ = ["Solved", "differentiable"]
 
+CENTRINGS = 1  # Newton steps onto the central path before the solution is differentiated
 NO_BOUNDS = Bounds(None, None, None, None, None)
 
 
@@ -123,9 +124,12 @@ def _tangents(form: _Form, result: Solved, contacts: Contacts, change: Any) -> S
     point = Point(-to_lanes(kept(ok, y, 0.0)), None, cone(u), cone(z), NO_BOUNDS, NO_BOUNDS)
     scales = jax.tree.map(lambda x: lax.stop_gradient(to_lanes(kept(ok, flat(x), 1.0))), result.scales)
     program = _program(form, data, scales)
+    fixed = lax.stop_gradient((data, scales))
+    for _ in range(CENTRINGS):
+        near = tiled_solver(partial(_program, form), *fixed, lax.stop_gradient(point), form.width)
+        point = centred(lax.stop_gradient(program), point, near)
     _, residual = jax.jvp(lambda c: residuals(_program(form, c, scales), point), (data,), (changes,))
-    fixed = lax.stop_gradient((data, scales, point))
-    solver = tiled_solver(partial(_program, form), *fixed, form.width)
+    solver = tiled_solver(partial(_program, form), *fixed, lax.stop_gradient(point), form.width)
     moved = point_tangent(program, point, residual, solver)
     _, cost = jax.jvp(lambda c: lagrangian(_program(form, c, scales), point), (data,), (changes,))
     t = 1 - cone_sum(program.price * point.u[0])

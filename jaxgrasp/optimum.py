@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from ._types import Array, proven_limit, rounding_constant, unit_roundoff
+from ._types import Array, edge_tolerance, proven_limit, rounding_constant, unit_roundoff
 from .balance import Balance, Demand, Load
 from .cones import Cone, cone_max, cone_sum, inner, interior_distance, tail_norm
 from .contacts import Component
@@ -149,10 +149,9 @@ def answer(
     escape = to_twist(projection, as_vector(ray[:m]))
     proof = _power_left(folded, program, escape, None if program.bound is None else ray[m:], load, limit)
     off_proof = _power_left(folded, program, load.twist, None, load, limit)
-    fine = rounding_constant() * unit_roundoff(dtype)
     status = _statuses(
         program.smoothing, problem.valid, load.off, load.rest & (weight is None), stop, short, cost, bound - blur,
-        scale, tolerance, proof, off_proof, fine,
+        scale, tolerance, proof, off_proof, edge_tolerance(dtype),
     )  # fmt: skip
 
     multiplier = to_twist(projection, as_vector(rows[:m]))

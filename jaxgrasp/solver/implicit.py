@@ -23,11 +23,11 @@ import jax.numpy as jnp
 from jax import lax
 
 from .._types import Array
-from ..cones import Cone, cone_sum, inner
+from ..cones import Cone, cone_min, cone_sum, inner
 from .convex import Bounds, ConvexProgram, Optional, Point
 from .newton_matrix import Motion, Newton, families, newton_at, newton_product, products, tail_size
 
-__all__ = ["Residuals", "lagrangian", "point_tangent", "residuals"]
+__all__ = ["Residuals", "centred", "lagrangian", "point_tangent", "residuals"]
 
 
 class Residuals(NamedTuple):
@@ -80,6 +80,36 @@ def lagrangian(program: ConvexProgram, point: Point) -> Array:
         logs = program.cone_floor / 2 * jnp.log(det) + program.head_floor * jnp.log(head)
         total = total - cone_sum(exists * logs)
     return total
+
+
+def centred(program: ConvexProgram, point: Point, solve: Callable[[Motion], Motion]) -> Point:
+    """One Newton step of a program of cones alone towards ``u_i o z_i = mu e``, mu the mean product; held constant.
+
+    A gap of g leaves the point open to the root of g across the central path, and derivatives with it; on the path
+    they are right to g. A step that leaves a cone is not taken.
+    """
+    exists, u, z = program.exists, point.u, point.z
+    one = jnp.ones_like(exists)
+    mean = cone_sum(exists * inner(u, z)) / cone_sum(exists)
+    det = jnp.where(exists > 0, (u[0] - tail_size(u)) * (u[0] + tail_size(u)), one)
+    pull = exists * mean / det
+    target = (pull * u[0] - exists * z[0], *(-pull * a - exists * b for a, b in zip(u[1:], z[1:], strict=True)))
+    x = solve(Motion(target, jnp.zeros_like(point.y), None, None))
+    dz = program.gradient(x.u, x.y, jnp.zeros_like(mean))
+    new_u = tuple(a + exists * b for a, b in zip(u, x.u, strict=True))
+    new_z = tuple(a + exists * b for a, b in zip(z, dz, strict=True))
+    good = jnp.isfinite(cone_sum(new_u[0] + new_z[0]))
+    for v in (new_u, new_z):
+        good = good & (cone_min(jnp.where(exists > 0, v[0] - tail_size(v), one)) > 0)
+
+    def moved(new: Array, old: Array) -> Array:
+        return old + lax.stop_gradient(jnp.where(good, new - old, jnp.zeros_like(old)))
+
+    return point._replace(
+        y=moved(point.y + x.y, point.y),
+        u=tuple(map(moved, new_u, u)),
+        z=tuple(map(moved, new_z, z)),
+    )
 
 
 def point_tangent(
