@@ -22,6 +22,7 @@ __all__ = [
     "largest_response",
     "pivot_tolerance",
     "rank_tolerance",
+    "real_array",
     "rounding_constant",
     "stationary_tolerance",
     "unit_roundoff",
@@ -45,6 +46,19 @@ class SpokenEnum(IntEnum):
     def _missing_(cls, value: Any):
         # An entry of a JAX array: equal to a member, but no key of the enum's table on every Python.
         return next((member for member in cls if np.ndim(value) == 0 and member.value == value), None)
+
+
+def real_array(value: Any, name: str, means: str = "a number or an array of numbers") -> Array:
+    """``value`` as an array of a floating dtype; ValueError, with what it ``means``, where it holds no real numbers."""
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be {means}, got {value!r}") from error
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        return array
+    if not jnp.issubdtype(array.dtype, jnp.integer):
+        raise ValueError(f"{name} must hold real numbers, got dtype {array.dtype}")
+    return array.astype(jnp.result_type(float))
 
 
 def unit_roundoff(dtype) -> float:

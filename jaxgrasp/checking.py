@@ -5,6 +5,9 @@ closed loop. Wrench resistant grasps are held by computed torque, grasps that ar
 A grasp is recovered if after every push it comes to stay within 1 mm and 1 degree, with forces that were the commanded
 ones in every step (for the regulator: or the nearest admissible ones).
 
+A chunk of grasps is checked in one batch and kept as a shard (``shards``): memory does not grow with their number,
+and a killed run goes on where it was. A row depends on its grasp alone.
+
 The Parquet file has a row for each grasp:
 
     row, grasp_id   int64             in the source (a sampled grasp: its number)
@@ -22,7 +25,9 @@ The Parquet file has a row for each grasp:
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+import shlex
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +36,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from . import meshes
 from .backend import precision
@@ -39,13 +45,15 @@ from .control import ComputedTorque, ContactController, ControlStatus, Gains
 from .controllability import Controllability, ControllabilityVerdict, controllability
 from .dynamics import BodyState, RigidBody
 from .errors import UserError
-from .formats.parquet import Contacts, dump, write
+from .formats.parquet import Contacts, dump
 from .grasp import Grasp
 from .regulator import regulator
 from .run import Request, Run
 from .run import prepare as prepare_run
+from .shards import Shards
+from .summary import Summary
 
-__all__ = ["CheckRequest", "CheckRun", "check", "prepare", "schema"]
+__all__ = ["CheckRequest", "CheckRun", "check", "checked_columns", "controllability_of", "prepare", "schema"]
 
 TIMESTEP, STEPS, RATE = 0.002, 800, 25.0  # s, -, 1/s
 PUSH, SHARE = (25, 50), 0.5  # steps of the push; its force in weights
@@ -57,7 +65,8 @@ V = ControllabilityVerdict
 class CheckRequest:
     """What the user asked for. ``grasps``: where they come from (a ``run.Request``); mass kg; gravity m/s^2, mesh axes.
 
-    object  the mesh whose inertia counts, if it is not the one the grasps were made on; grasps at most ``most``
+    object  the mesh whose inertia counts, if it is not the one the grasps were made on
+    most    grasps, the first ones, are checked, ``grasps.chunk`` at a time
     """
 
     grasps: Request
@@ -70,22 +79,15 @@ class CheckRequest:
 
 @dataclass(frozen=True)
 class CheckRun:
-    """A checked request: the grasps, the body they hold."""
+    """A checked request: the grasps, the body they hold. ``metadata`` identify the run and go into the file."""
 
     run: Run
     body: RigidBody
     gravity: np.ndarray
     count: int
     output: Path
+    metadata: dict[str, Any]
     warnings: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Checked:
-    """Columns of the file as arrays, and the controllability behind them."""
-
-    columns: dict[str, np.ndarray]
-    found: Controllability
 
 
 def prepare(request: CheckRequest) -> CheckRun:
@@ -122,7 +124,35 @@ def prepare(request: CheckRequest) -> CheckRun:
     output = request.output or Path(f"{stem}.check.parquet")
     if output.resolve() == Path(request.grasps.source).resolve():
         raise UserError(f"{output} is the source; name another file with -o")
-    return CheckRun(run, body, gravity, min(run.candidates, request.most), output, tuple(warnings))
+    count = min(run.candidates, request.most)
+    about = {
+        "command": _command(request, run),
+        "mass": request.mass,
+        "gravity": gravity.tolist(),
+        "inertia": {"name": solid.name, "sha256": solid.sha256},
+        "checked": count,
+        "chunk": run.chunk,
+    }
+    return CheckRun(run, body, gravity, count, output, run.metadata | about, tuple(warnings))
+
+
+def _command(request: CheckRequest, run: Run) -> str:
+    """What to type for this very run."""
+    grasps, words = request.grasps, ["jaxgrasp", "check", request.grasps.source]
+    options: list[tuple[str, Any]] = [
+        ("--mass", request.mass),
+        ("--gravity", ",".join(map(repr, map(float, request.gravity)))),
+        ("--most", request.most),
+        ("--chunk", run.chunk),
+        ("--fingers", grasps.fingers),
+        ("--model", grasps.model),
+        ("--friction", grasps.friction),
+        ("--torsion", grasps.torsion),
+        ("--seed", run.metadata["seed"] if "sampler" in run.metadata else None),
+        ("--unit", run.metadata["unit"] if "sampler" in run.metadata else None),
+        ("--object", request.object),
+    ]
+    return shlex.join(words + [str(x) for pair in options if pair[1] is not None for x in pair])
 
 
 def schema(metadata: dict[str, Any]) -> pa.Schema:
@@ -136,43 +166,90 @@ def schema(metadata: dict[str, Any]) -> pa.Schema:
     return pa.schema(list(zip(names, kinds, strict=True)), {b"jaxgrasp": dump(metadata)})
 
 
-def check(run: CheckRun) -> Checked:
-    """All grasps of the run, in one batch, written to ``run.output``."""
-    parts = list(_first(run))
-    with precision("float64"):
-        contacts = [c for _, c in parts]
-        coefficients = [run.run.coefficients(c) for c in contacts]
-        position = np.concatenate([c.position for c in contacts]) - run.run.centre_of_mass
-        normal = np.concatenate([c.normal for c in contacts])
-        friction, torsion = (np.concatenate([pair[i] for pair in coefficients]) for i in (0, 1))
-        masks = [c.active for c in contacts if c.active is not None]
-        active = np.concatenate(masks) if masks else None
-        model = run.run.model.with_coefficients(jnp.asarray(friction), jnp.asarray(torsion))
-        checked = _checked(Grasp(position, normal, model, active), run.body, run.gravity)
-    rows = {"row": np.concatenate([r for r, _ in parts])}
-    rows["grasp_id"] = np.concatenate([c.grasp_id for c in contacts])
-    checked = dataclasses.replace(checked, columns=rows | checked.columns)
-    kind = schema(run.run.metadata | {"mass": float(run.body.mass), "gravity": run.gravity.tolist()})
-    try:
-        write(run.output, [_table(checked.columns, kind)], kind)
-    except OSError as error:
-        raise UserError(f"cannot write {run.output}: {error.strerror or error}") from error
-    return checked
+def check(run: CheckRun, resume: bool = False, progress: Callable[[Summary], None] | None = None) -> Summary:
+    """Check all grasps of the run and write ``run.output``; counts of their wrench resistance, and times.
+
+    resume    go on with an unfinished run of the same options
+    progress  called with the running summary before the first chunk and after every chunk
+
+    Raises UserError where the output cannot be written or belongs to another run. KeyboardInterrupt leaves the
+    finished shards for ``resume``.
+    """
+    tell, total = progress or (lambda _: None), Summary(run.count)
+    shards, kind = Shards(run.output, dump(run.metadata)), schema(run.metadata)
+    if resume and shards.finished() is not None:
+        total.add(_counted(checked_columns(run.output)["status"]))
+        total.resumed = run.count
+        return total
+    started = time.perf_counter()
+    with shards.claimed(resume), precision("float64"):
+        for number, (start, stop, load) in enumerate(run.run.chunks()):
+            stop = min(stop, run.count)
+            if start >= stop:
+                break
+            known = shards.read(number, start, stop)
+            if known is None:
+                tell(total)
+                columns = {"row": np.arange(start, stop), **_checked(run, _first(load(), stop - start))}
+                shards.write(number, _table(columns, kind), {"start": start, "stop": stop})
+                part = _counted(columns["status"])
+                part.solved = stop - start
+            else:
+                part = _counted(known[0]["status"].to_numpy())
+                total.resumed += stop - start
+            total.add(part)
+            total.seconds = time.perf_counter() - started
+            tell(total)
+        shards.assemble(kind)
+    return total
 
 
-def _first(run: CheckRun) -> Iterator[tuple[np.ndarray, Contacts]]:
-    """Row numbers and contacts of the first ``run.count`` grasps."""
+def _counted(status: np.ndarray) -> Summary:
+    return Summary.of(status, np.full(len(status), np.nan))
+
+
+def checked_columns(path: Path) -> dict[str, np.ndarray]:
+    """The columns of a file of checked grasps as arrays: NaN where a number is null, False where recovered is."""
+    table = pq.read_table(path)
+    columns = {name: table[name] for name in table.column_names if name != "weakest"}
+    columns["recovered"] = columns["recovered"].fill_null(False)
+    return {name: x.to_numpy() for name, x in columns.items()}
+
+
+def controllability_of(run: CheckRun, row: int) -> Controllability:
+    """That of the grasp in ``row``, in a batch of one."""
     for start, stop, load in run.run.chunks():
-        keep = min(stop, run.count) - start
-        if keep <= 0:
-            return
-        contacts = load()
-        values: dict[str, Any] = {f.name: getattr(contacts, f.name) for f in dataclasses.fields(contacts)}
-        kept = {name: None if x is None else np.asarray(x)[:keep] for name, x in values.items()}
-        yield np.arange(start, start + keep), dataclasses.replace(contacts, **kept)
+        if start <= row < stop:
+            with precision("float64"):
+                grasp = _grasp(run, _first(load(), run.count - start))
+                found = controllability(grasp, run.body, run.gravity)
+            lane = slice(row - start, row - start + 1)
+            return jax.tree.map(lambda x, lane=lane: x[lane], found)
+    raise ValueError(f"there is no row {row}")
 
 
-def _checked(grasp: Grasp, body: RigidBody, gravity: np.ndarray) -> Checked:
+def _first(contacts: Contacts, count: int) -> Contacts:
+    values: dict[str, Any] = {f.name: getattr(contacts, f.name) for f in dataclasses.fields(contacts)}
+    kept: dict[str, Any] = {name: None if x is None else np.asarray(x)[:count] for name, x in values.items()}
+    return Contacts(**kept)
+
+
+def _grasp(run: CheckRun, contacts: Contacts) -> Grasp:
+    """With lanes without contacts at the end, so that every chunk has one shape; they end at once."""
+    count, size = len(contacts), min(run.run.chunk, run.count)
+    friction, torsion = run.run.coefficients(contacts)
+    active = np.ones(friction.shape, bool) if contacts.active is None else contacts.active
+    values = (contacts.position - run.run.centre_of_mass, contacts.normal, friction, torsion, active)
+    fill = [(0, max(size - count, 0))]
+    position, normal, friction, torsion, active = (np.pad(x, fill + [(0, 0)] * (x.ndim - 1)) for x in values)
+    return Grasp(
+        position, normal, run.run.model.with_coefficients(jnp.asarray(friction), jnp.asarray(torsion)), active
+    )
+
+
+def _checked(run: CheckRun, contacts: Contacts) -> dict[str, np.ndarray]:
+    """The columns of these rows, but their number."""
+    grasp, body, gravity, count = _grasp(run, contacts), run.body, run.gravity, len(contacts)
     found = controllability(grasp, body, gravity)
     verdict = np.asarray(found.verdict)
     held = _disturbed(grasp, body, ComputedTorque(Gains.of_rate(RATE)), gravity)
@@ -195,7 +272,7 @@ def _checked(grasp: Grasp, body: RigidBody, gravity: np.ndarray) -> Checked:
         "peak_force": held["peak_force"],
         "cone_use": held["cone_use"],
     }
-    return Checked(columns, found)
+    return {"grasp_id": contacts.grasp_id, **{name: x[:count] for name, x in columns.items()}}
 
 
 def _disturbed(

@@ -10,7 +10,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from .terminal import numbers, say
+from .status import Status
+from .terminal import ProgressBar, numbers, say
 
 __all__ = ["CHECK_HELP", "check"]
 
@@ -39,6 +40,10 @@ def check(
         str, typer.Option(metavar="X,Y,Z", help="Gravity in m/s^2, in the mesh's frame.")
     ] = "0,0,-9.81",
     most: Annotated[int, typer.Option(help="Check at most this many grasps, the first ones.")] = 256,
+    chunk: Annotated[int, typer.Option(help="Grasps checked together; memory grows with it.")] = 256,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with an unfinished run of the same options.")
+    ] = False,
     row: Annotated[int | None, typer.Option("--row", help="Say this row in words, too.")] = None,
     fingers: Annotated[
         int | None, typer.Option("--fingers", "-k", help="Of sampled grasps (default: 4).")
@@ -58,7 +63,7 @@ def check(
     ] = None,
 ) -> None:
     from .backend import precision, remember_compilations, usable_backend
-    from .checking import CheckRequest, prepare
+    from .checking import CheckRequest, checked_columns, controllability_of, prepare
     from .checking import check as start
     from .controllability_words import explain_controllability
     from .errors import UserError
@@ -70,22 +75,33 @@ def check(
     assert down is not None
     usable_backend(say)
     remember_compilations()
-    grasps = Request(source, None, fingers, model, friction, torsion, None, seed, unit)
+    grasps = Request(
+        source, None, fingers, model, friction, torsion, seed=seed, unit=unit, chunk=min(chunk, most)
+    )
     with precision("float64"):
         run = prepare(CheckRequest(grasps, mass, (down[0], down[1], down[2]), object, most, output))
         for warning in run.warnings:
             say(f"warning: {warning}")
         if row is not None and not 0 <= row < run.count:
             raise UserError(f"rows 0 to {run.count - 1} are checked, there is no row {row}; see --most")
-        checked = start(run)
-    console = Console()
-    console.print(_counts(checked.columns, f"{Path(source).name}: {run.count:,} grasps"))
-    back = checked.columns["recovered"]
+        try:
+            with ProgressBar(Console(stderr=True), run.count, Status.RESISTANT, "reading") as bar:
+                summary = start(run, resume, bar.show)
+        except KeyboardInterrupt:
+            again = "" if resume else " and --resume"
+            say(f"stopped; the finished part is in {run.output}.parts: go on with the same command{again}")
+            raise
+        found = None if row is None else controllability_of(run, row)
+    console, columns = Console(), checked_columns(run.output)
+    console.print(_counts(columns, f"{Path(source).name}: {run.count:,} grasps"))
+    back = columns["recovered"]
     if back.any():
-        console.print(_worst(checked.columns, back))
-    if row is not None:
-        words = explain_controllability(checked.found, row, run.run.centre_of_mass)
+        console.print(_worst(columns, back))
+    if found is not None:
+        words = explain_controllability(found, 0, run.run.centre_of_mass)
         console.print(f"Row {row}: {words}", highlight=False, soft_wrap=True, markup=False)
+    if summary.resumed:
+        console.print(f"{summary.resumed:,} grasps were already done", highlight=False)
     console.print(f"written to {run.output}", highlight=False, soft_wrap=True, markup=False)
 
 

@@ -9,13 +9,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ._types import Array, Float, Int
+from ._types import Array, Float, Int, real_array
 from .admissible import cone_use
 from .control import ContactController, ControlStatus, Reference, tracking_error
 from .dynamics import BodyState, RigidBody, advance
-from .geometry import wrench_dimension
+from .geometry import applied, wrench_dimension
 from .grasp import Grasp, grasp_map
-from .rotations import rotate
+from .rotations import rotate_wrench
 from .simulation import MujocoPlant
 
 __all__ = ["ClosedLoop", "close_loop"]
@@ -67,14 +67,6 @@ def _size(v: Array) -> Array:
     return jnp.sqrt(jnp.sum(v * v, axis=-1))
 
 
-def _world_wrench(G: Array, state: BodyState, force: Array) -> Array:
-    d = state.dimension
-    w = jnp.sum(G * force[..., None, :], axis=-1)
-    return jnp.concatenate(
-        [rotate(state.orientation, w[..., :d]), rotate(state.orientation, w[..., d:])], axis=-1
-    )
-
-
 @functools.partial(jax.jit, static_argnames=("steps", "record", "moving"))
 def _run(setting: _Setting, state: BodyState, reference: Reference, pushes, steps, timestep, record, moving):
     grasp, body, controller, gravity, plant = setting
@@ -90,7 +82,7 @@ def _run(setting: _Setting, state: BodyState, reference: Reference, pushes, step
         invalid = ((command.status == ControlStatus.INVALID.value) | ~sound)[..., None]
         status = jnp.where(sound, command.status, jnp.int32(ControlStatus.INVALID.value))
         command = command._replace(force=jnp.where(invalid, 0.0, command.force), status=status)
-        wrench = _world_wrench(G, now, command.force)
+        wrench = rotate_wrench(now.orientation, applied(G, command.force))
         if at[1] is not None:
             wrench = wrench + at[1]
         after = advance(body, now, wrench, timestep, gravity) if plant is None else plant.advance(now, wrench)
@@ -185,7 +177,7 @@ def close_loop(
     reference, moving = _laid_out(reference, batch, steps, dtype)
     pushes = None
     if disturbance is not None:
-        pushes = jnp.asarray(disturbance).astype(dtype)
+        pushes = real_array(disturbance, "disturbance").astype(dtype)
         if pushes.shape not in ((steps, m), (steps, *batch, m)):
             raise ValueError(
                 f"disturbance must have shape ({steps}, {m}) or ({steps}, *batch, {m}), got {pushes.shape}"

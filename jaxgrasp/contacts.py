@@ -17,7 +17,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
-from ._types import Array, Float
+from ._types import Array, Float, real_array
 
 __all__ = ["Component", "ContactModel", "Frictionless", "HardFinger", "SoftFinger"]
 
@@ -29,16 +29,6 @@ class Component(Enum):
     TANGENT_2 = "f_y"
     NORMAL = "f_n"
     SPIN = "tau_n"
-
-
-def _parameter(value, name: str) -> Array:
-    try:
-        array = jnp.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be a number or an array of numbers, got {value!r}") from error
-    if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
-        raise ValueError(f"{name} must be a number or an array of numbers, got dtype {array.dtype}")
-    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.result_type(float))
 
 
 class ContactModel(eqx.Module):
@@ -149,7 +139,7 @@ class Frictionless(ContactModel):
     zero: Array
 
     def __init__(self, zero: Any = 0.0):  # zeros in the shape of the contacts
-        self.zero = _parameter(zero, "the placeholder")
+        self.zero = real_array(zero, "the placeholder")
 
     def components(self, dimension: int) -> tuple[Component, ...]:
         return (Component.NORMAL,)
@@ -182,7 +172,7 @@ class HardFinger(ContactModel):
     friction: Array
 
     def __init__(self, friction: Any = 0.5):
-        self.friction = _parameter(friction, "friction")
+        self.friction = real_array(friction, "friction")
 
     def components(self, dimension: int) -> tuple[Component, ...]:
         if dimension == 2:
@@ -228,8 +218,8 @@ class SoftFinger(ContactModel):
     torsion: Array
 
     def __init__(self, friction: Any = 0.5, torsion: Any = 0.01):
-        self.friction = _parameter(friction, "friction")
-        self.torsion = _parameter(torsion, "torsion")
+        self.friction = real_array(friction, "friction")
+        self.torsion = real_array(torsion, "torsion")
 
     def components(self, dimension: int) -> tuple[Component, ...]:
         if dimension == 2:

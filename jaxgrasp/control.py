@@ -22,9 +22,9 @@ from .admissible import into_cones
 from .criteria import Criterion, SumOfSquares
 from .dynamics import BodyState, RigidBody, coriolis, gravity_term
 from .forces import optimize_forces
-from .geometry import cross, wrench_dimension
+from .geometry import applied, cross, wrench_dimension
 from .grasp import Grasp, grasp_map
-from .rotations import jacobian_product, jacobian_solve, rotate, rotation_between, turned
+from .rotations import jacobian_product, jacobian_solve, rotate, rotate_wrench, rotation_between, turned
 from .status import Status
 
 __all__ = [
@@ -213,11 +213,8 @@ class ContactController(eqx.Module):
 
 
 def _gained(gain: Array, v: Array) -> Array:
-    return (
-        gain.astype(v.dtype) * v
-        if gain.ndim == 0
-        else jnp.sum(gain.astype(v.dtype) * v[..., None, :], axis=-1)
-    )
+    gain = gain.astype(v.dtype)
+    return gain * v if gain.ndim == 0 else applied(gain, v)
 
 
 class ComputedTorque(ContactController):
@@ -272,28 +269,21 @@ class ComputedTorque(ContactController):
             torque = body.inertia[..., 0] * q_dd[..., d:]
         else:
             inner = rotate(state.orientation, q_dd[..., d:], inverse=True)
-            torque = rotate(state.orientation, jnp.sum(body.inertia * inner[..., None, :], axis=-1))
+            torque = rotate(state.orientation, applied(body.inertia, inner))
         inertial = jnp.concatenate([body.mass[..., None] * q_dd[..., :d], torque], axis=-1)
         return inertial + coriolis(body, state) + gravity_term(body, gravity)
 
     def command(
         self, grasp: Grasp, body: RigidBody, state: BodyState, reference: Reference, last: Array, gravity: Any
     ) -> Command:
-        d = state.dimension
-        w = self.wrench(body, state, reference, gravity)
-        asked = jnp.concatenate(
-            [
-                rotate(state.orientation, w[..., :d], inverse=True),
-                rotate(state.orientation, w[..., d:], inverse=True),
-            ],
-            axis=-1,
-        )
+        world = self.wrench(body, state, reference, gravity)
+        asked = rotate_wrench(state.orientation, world, inverse=True)
         found = optimize_forces(
             grasp, -asked, self.criterion, self.max_normal, self.torque_limits, tolerance=self.tolerance
         )
         cap = None if self.max_normal is None else self.max_normal.astype(asked.dtype)
         force = into_cones(grasp, found.force, cap)
-        made = jnp.sum(grasp_map(grasp) * force[..., None, :], axis=-1)
+        made = applied(grasp_map(grasp), force)
         close = jnp.max(jnp.abs(made - asked), axis=-1) <= CLOSE * jnp.max(jnp.abs(asked), axis=-1)
         return _settled(found.status, force, close, last, asked)
 

@@ -23,7 +23,7 @@ from ._types import Array, Float, Int, SpokenEnum, rank_tolerance
 from .dynamics import RigidBody
 from .geometry import wrench_dimension
 from .grasp import Grasp
-from .linearization import OperatingPoint, Scaled, linearize, scaled_system
+from .linearization import OperatingPoint, Scaled, first_order, is_equilibrium, linearize, scaled_system
 from .resistance import wrench_resistance
 from .status import Status
 
@@ -114,14 +114,6 @@ def controllability_matrix(
     return jnp.concatenate(columns, axis=-1)
 
 
-def _first_order(system: Scaled) -> tuple[Array, Array]:
-    """A and B of (11.29) from the second-order system."""
-    A_c, B_c = system.A_c, system.B_c
-    zero, unit = jnp.zeros_like(A_c), jnp.broadcast_to(jnp.eye(A_c.shape[-1], dtype=A_c.dtype), A_c.shape)
-    A = jnp.concatenate([jnp.concatenate([zero, unit], -1), jnp.concatenate([A_c, zero], -1)], -2)
-    return A, jnp.concatenate([jnp.zeros_like(B_c), B_c], axis=-2)
-
-
 def gramian(
     A: Float[Array, "*batch s s"], B: Float[Array, "*batch s n"], horizon: Any = HORIZON
 ) -> Float[Array, "*batch s s"]:
@@ -177,7 +169,7 @@ def controllability(
     reduced = jnp.concatenate([system.B_c, system.A_c @ system.B_c], axis=-1)
     reduced_rank, values = _rank(reduced, cut)
     alone, _ = _rank(system.B_c, cut)
-    A, B = _first_order(system)
+    A, B = first_order(system.A_c, system.B_c)
     rank, _ = _rank(controllability_matrix(A, B)[..., : 4 * B.shape[-1]], cut)  # A^4 = 0
 
     full = reduced_rank == m
@@ -210,7 +202,7 @@ def _verdict(point: Array, status: Array, full: Array) -> Array:
 
     choose((point == OperatingPoint.MARGINAL.value) & full, ControllabilityVerdict.MARGINAL)
     choose((point == OperatingPoint.NON_MARGINAL.value) & full, ControllabilityVerdict.CONTROLLABLE)
-    known = (point == OperatingPoint.MARGINAL.value) | (point == OperatingPoint.NON_MARGINAL.value)
+    known = is_equilibrium(point)
     choose(known & ~full, ControllabilityVerdict.NOT_CONTROLLABLE)
     # an internal force moves any equilibrium of a resistant grasp inside the cones
     choose(known & full & (status == Status.RESISTANT.value), ControllabilityVerdict.RESISTANT)

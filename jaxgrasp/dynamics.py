@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ._types import Array, Bool, Float, unit_roundoff
-from .geometry import cross, wrench_dimension
+from ._types import Array, Bool, Float, real_array, unit_roundoff
+from .geometry import applied, cross, wrench_dimension
 from .grasp import Grasp, grasp_map
 from .rotations import identity_orientation, orientation_matrix, rotate, turned
 
@@ -34,16 +34,6 @@ __all__ = [
 STANDARD_GRAVITY = 9.81  # m/s^2, along -z (-y in the plane)
 
 
-def _real(value: Any, name: str) -> Array:
-    try:
-        array = jnp.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be a number or an array of numbers, got {value!r}") from error
-    if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
-        raise ValueError(f"{name} must hold real numbers, got dtype {array.dtype}")
-    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.result_type(float))
-
-
 class RigidBody(eqx.Module):
     """Mass and inertia of the object, or of a batch of objects.
 
@@ -60,7 +50,7 @@ class RigidBody(eqx.Module):
     inertia: Float[Array, "*batch t t"]
 
     def __init__(self, mass: Any, inertia: Any):
-        mass, inertia = _real(mass, "mass"), _real(inertia, "inertia")
+        mass, inertia = real_array(mass, "mass"), real_array(inertia, "inertia")
         if inertia.shape == mass.shape:
             inertia = inertia[..., None, None]
         elif inertia.shape[-2:] not in ((3, 3), (1, 1)):
@@ -215,17 +205,13 @@ def gravity_vector(gravity: Any, dimension: int, dtype) -> Float[Array, "*batch 
     """Gravity in m/s^2, world axes; None: 9.81 along -z, or -y in the plane."""
     if gravity is None:
         gravity = [0.0] * (dimension - 1) + [-STANDARD_GRAVITY]
-    array = _real(gravity, "gravity")
+    array = real_array(gravity, "gravity")
     if array.ndim < 1 or array.shape[-1] != dimension:
         raise ValueError(
             f"gravity must be a vector of {dimension} numbers in m/s^2, such as "
             f"{(0.0,) * (dimension - 1) + (-STANDARD_GRAVITY,)}, got shape {array.shape}"
         )
     return array.astype(dtype)
-
-
-def _applied(matrix: Array, v: Array) -> Array:
-    return jnp.sum(matrix * v[..., None, :], axis=-1)
 
 
 def mass_matrix(body: RigidBody, orientation: Float[Array, "*batch o"]) -> Float[Array, "*batch m m"]:
@@ -250,7 +236,7 @@ def coriolis(body: RigidBody, state: BodyState) -> Float[Array, "*batch m"]:
         return jnp.zeros_like(state.velocity)
     omega = state.velocity[..., d:]
     momentum = rotate(
-        state.orientation, _applied(body.inertia, rotate(state.orientation, omega, inverse=True))
+        state.orientation, applied(body.inertia, rotate(state.orientation, omega, inverse=True))
     )
     torque = cross(omega, momentum)
     return jnp.concatenate([jnp.zeros_like(torque), torque], axis=-1)
@@ -285,9 +271,9 @@ def acceleration(
         return jnp.concatenate([linear, torque / body.inertia[..., 0]], axis=-1)
     # in body axes the inertia and its inverse are constant
     omega = rotate(state.orientation, state.velocity[..., d:], inverse=True)
-    torque = rotate(state.orientation, torque, inverse=True) - cross(omega, _applied(body.inertia, omega))
+    torque = rotate(state.orientation, torque, inverse=True) - cross(omega, applied(body.inertia, omega))
     return jnp.concatenate(
-        [linear, rotate(state.orientation, _applied(body.inverse_inertia, torque))], axis=-1
+        [linear, rotate(state.orientation, applied(body.inverse_inertia, torque))], axis=-1
     )
 
 

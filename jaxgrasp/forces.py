@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
-from ._types import Array, Bool, Float, Int, gap_floor, unit_roundoff
+from ._types import Array, Bool, Float, Int, gap_floor, real_array, unit_roundoff
 from .balance import Balance, Demand, balance, proves, starting_point
 from .contacts import Component
 from .criteria import Criterion, Gentlest
@@ -217,20 +217,10 @@ def _solved(plan: _Plan, rows: Rows, tolerance: Array) -> Solved:
 # The question --------------------------------------------------------------------------------------------
 
 
-def _number(value: Any, name: str, dtype) -> Array:
-    try:
-        array = jnp.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be a number or an array of numbers, got {value!r}") from error
-    if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
-        raise ValueError(f"{name} must hold real numbers, got dtype {array.dtype}")
-    return array.astype(dtype)
-
-
 def spread_loads(grasp: Grasp, wrench: Any) -> tuple[Array, tuple[int, ...]]:
     """The wrench with all batch axes, and those axes: the grasp's, then any load axes."""
     m, batch = wrench_dimension(grasp.dimension), grasp.batch_shape
-    array = _number(wrench, "wrench", grasp.dtype)
+    array = real_array(wrench, "wrench").astype(grasp.dtype)
     if array.ndim < 1 or array.shape[-1] != m:
         raise ValueError(
             f"wrench must have shape (*batch, *loads, {m}): (force; torque about the centre of mass), got {array.shape}"
@@ -286,7 +276,7 @@ def _demand(
         log_det = (a, b, c)
     cap = None
     if max_normal is not None:
-        cap = _spread(_number(max_normal, "max_normal", dtype), (k,), batch, shape, "max_normal")
+        cap = _spread(real_array(max_normal, "max_normal").astype(dtype), (k,), batch, shape, "max_normal")
     jacobian = torque = None
     if torque_limits is not None:
         try:
@@ -295,7 +285,7 @@ def _demand(
             raise ValueError(
                 f"torque_limits must be a pair (J, tau_max): J of shape (*batch, {k * n}, q) and tau_max (q)"
             ) from error
-        jacobian = _number(jacobian, "the hand Jacobian J", dtype)
+        jacobian = real_array(jacobian, "the hand Jacobian J").astype(dtype)
         if jacobian.ndim < 2 or jacobian.shape[-2] != k * n:
             raise ValueError(
                 f"the hand Jacobian J must have shape (*batch, {k * n}, q): one row for each force component "
@@ -303,7 +293,7 @@ def _demand(
             )
         joints = jacobian.shape[-1]
         jacobian = _spread(jacobian, (k * n, joints), batch, shape, "the hand Jacobian J")
-        torque = _spread(_number(torque, "tau_max", dtype), (joints,), batch, shape, "tau_max")
+        torque = _spread(real_array(torque, "tau_max").astype(dtype), (joints,), batch, shape, "tau_max")
     return spread, Demand(wrench, criterion, log_det, cap, jacobian, torque)
 
 

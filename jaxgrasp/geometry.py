@@ -12,6 +12,7 @@ from ._types import Array, Float
 
 __all__ = [
     "Components",
+    "applied",
     "components",
     "contact_frame",
     "cross",
@@ -34,6 +35,11 @@ def components(v: Float[Array, "*batch d"]) -> Components:
 def wrench_dimension(dimension: int) -> int:
     """m = 3 for planar bodies (dimension 2), m = 6 for spatial ones (dimension 3)."""
     return {2: 3, 3: 6}[dimension]
+
+
+def applied(matrix: Float[Array, "*batch m n"], v: Float[Array, "*batch n"]) -> Float[Array, "*batch m"]:
+    """``matrix v``, lane by lane."""
+    return jnp.sum(matrix * v[..., None, :], axis=-1)
 
 
 def skew(v: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 
-from ._types import Array, Bool, Float, rank_tolerance
+from ._types import Array, Bool, Float, rank_tolerance, real_array
 from .contacts import Component, ContactModel
 from .geometry import contact_frame, cross, normalize, wrench_dimension
 
@@ -27,18 +27,13 @@ __all__ = [
 
 
 def _vectors(value, name: str) -> Array:
-    try:
-        array = jnp.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be an array of shape (*batch, k, 3) or (*batch, k, 2)") from error
-    if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
-        raise ValueError(f"{name} must hold real numbers, got dtype {array.dtype}")
+    array = real_array(value, name, "an array of shape (*batch, k, 3) or (*batch, k, 2)")
     if array.ndim < 2 or array.shape[-1] not in (2, 3) or array.shape[-2] < 1:
         raise ValueError(
             f"{name} must have shape (*batch, k, 3) in space or (*batch, k, 2) in the plane with k >= 1 "
             f"contacts, got {array.shape}"
         )
-    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.result_type(float))
+    return array
 
 
 def _per_contact(value: Array, shape: tuple[int, ...], name: str) -> Array:

@@ -17,13 +17,21 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ._types import Array, Float, Int, SpokenEnum, balance_tolerance
+from ._types import Array, Bool, Float, Int, SpokenEnum, balance_tolerance, real_array
 from .dynamics import RigidBody, gravity_vector
 from .equilibrium import EquilibriumKind, equilibrium
-from .geometry import skew, wrench_dimension
+from .geometry import applied, skew, wrench_dimension
 from .grasp import Grasp, folded_grasp_map, grasp_map, length_scale
 
-__all__ = ["Linearization", "OperatingPoint", "Scaled", "linearize", "scaled_system"]
+__all__ = [
+    "Linearization",
+    "OperatingPoint",
+    "Scaled",
+    "first_order",
+    "is_equilibrium",
+    "linearize",
+    "scaled_system",
+]
 
 
 class OperatingPoint(SpokenEnum):
@@ -107,7 +115,7 @@ def _judged(grasp: Grasp, load: Array, force: Array) -> tuple[Array, Array]:
     parts = force.reshape(*force.shape[:-1], grasp.contacts, n)
     slack = jnp.where(grasp.active, grasp.model.feasibility_slack(parts, d), jnp.inf)
     slack = jnp.min(slack, axis=-1)
-    left = jnp.sum(grasp_map(grasp) * force[..., None, :], axis=-1) + load
+    left = applied(grasp_map(grasp), force) + load
     per_length = jnp.where(jnp.arange(load.shape[-1]) < d, 1.0, 1 / length_scale(grasp)[..., None])
     largest = jnp.max(jnp.abs(force), axis=-1) + jnp.max(jnp.abs(load), axis=-1)
     allowed = balance_tolerance(grasp.dtype) * largest
@@ -118,6 +126,20 @@ def _judged(grasp: Grasp, load: Array, force: Array) -> tuple[Array, Array]:
     point = jnp.where(bad, OperatingPoint.NOT_BALANCED.value, point).astype(jnp.int32)
     finite = jnp.all(jnp.isfinite(force), axis=-1)
     return jnp.where(finite, point, jnp.int32(OperatingPoint.INVALID.value)), slack
+
+
+def is_equilibrium(point: Int[Array, "*batch"]) -> Bool[Array, "*batch"]:
+    """Whether an ``OperatingPoint`` is an equilibrium, marginal or not."""
+    return (point == OperatingPoint.NON_MARGINAL.value) | (point == OperatingPoint.MARGINAL.value)
+
+
+def first_order(
+    A_c: Float[Array, "*batch m m"], B_c: Float[Array, "*batch m n"]
+) -> tuple[Float[Array, "*batch s s"], Float[Array, "*batch s n"]]:
+    """``[[0, I], [A_c, 0]]`` and ``[[0], [B_c]]`` of ``x'' = A_c x + B_c f``."""
+    zero, unit = jnp.zeros_like(A_c), jnp.broadcast_to(jnp.eye(A_c.shape[-1], dtype=A_c.dtype), A_c.shape)
+    A = jnp.concatenate([jnp.concatenate([zero, unit], -1), jnp.concatenate([A_c, zero], -1)], -2)
+    return A, jnp.concatenate([jnp.zeros_like(B_c), B_c], axis=-2)
 
 
 def linearize(
@@ -149,7 +171,7 @@ def linearize(
         found = equilibrium(grasp, load, tolerance)
         point, slack, forces = _kinds(found.kind), found.slack, found.force
     else:
-        forces = jnp.asarray(force).astype(dtype)
+        forces = real_array(force, "force").astype(dtype)
         size = grasp.contacts * grasp.model.force_size(d)
         if forces.ndim < 1 or forces.shape[-1] != size:
             raise ValueError(
@@ -161,14 +183,8 @@ def linearize(
         good = _good_numbers(grasp)
         point = jnp.where(good, point, jnp.int32(OperatingPoint.INVALID.value))
     point = jnp.where(fit, point, jnp.int32(OperatingPoint.INVALID.value))
-    there = (point == OperatingPoint.NON_MARGINAL.value) | (point == OperatingPoint.MARGINAL.value)
-    A_c, B_c = _blocks(_sound(grasp), body, g)
-    zero = jnp.zeros((*grasp.batch_shape, m, m), dtype)
-    unit = jnp.broadcast_to(jnp.eye(m, dtype=dtype), zero.shape)
-    A = jnp.concatenate(
-        [jnp.concatenate([zero, unit], axis=-1), jnp.concatenate([A_c, zero], axis=-1)], axis=-2
-    )
-    B = jnp.concatenate([jnp.zeros_like(B_c), B_c], axis=-2)
+    there = is_equilibrium(point)
+    A, B = first_order(*_blocks(_sound(grasp), body, g))
     keep = there[..., None, None]
     return Linearization(
         point,

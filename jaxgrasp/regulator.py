@@ -20,8 +20,9 @@ from ._types import Array, Bool, Float, Int
 from .admissible import nearest_admissible
 from .control import Command, ContactController, ControlStatus, Reference, tracking_error
 from .dynamics import BodyState, RigidBody
+from .geometry import applied
 from .grasp import Grasp, grasp_map
-from .linearization import OperatingPoint, Scaled, linearize, scaled_system
+from .linearization import OperatingPoint, Scaled, is_equilibrium, linearize, scaled_system
 
 __all__ = ["Regulator", "regulator", "riccati"]
 
@@ -76,14 +77,14 @@ class Regulator(ContactController):
         at = tracking_error(state, reference)
         away = state.velocity - reference.velocity
         x = jnp.concatenate([at.error, away[..., :d], at.spin], axis=-1)
-        wanted = self.force - jnp.sum(self.gain * x[..., None, :], axis=-1)
+        wanted = self.force - applied(self.gain, x)
         force = nearest_admissible(grasp, wanted)
         change, size = jnp.max(jnp.abs(force - wanted), axis=-1), jnp.max(jnp.abs(wanted), axis=-1)
         said = jnp.where(change <= 1e-9 * size, ControlStatus.COMMANDED.value, ControlStatus.PROJECTED.value)
         said = jnp.where(self.stabilizes, said, ControlStatus.UNREGULATED.value)
         bad = ~jnp.all(jnp.isfinite(x), axis=-1) | (self.point == OperatingPoint.INVALID.value)
         said = jnp.where(bad, ControlStatus.INVALID.value, said).astype(jnp.int32)
-        asked = jnp.sum(grasp_map(grasp) * wanted[..., None, :], axis=-1)
+        asked = applied(grasp_map(grasp), wanted)
         return Command(jnp.where(bad[..., None], 0.0, force), said, asked)
 
 
@@ -143,10 +144,7 @@ def regulator(
         raise ValueError(f"timestep must be positive, got {timestep}")
     linear = linearize(grasp, body, force, gravity)
     system = scaled_system(grasp, body, gravity)
-    there = (linear.point == OperatingPoint.NON_MARGINAL.value) | (
-        linear.point == OperatingPoint.MARGINAL.value
-    )
     gain, stable = _design(grasp, system, jnp.asarray(timestep, system.A_c.dtype), effort * effort)
-    good = there & stable
+    good = is_equilibrium(linear.point) & stable
     gain = jnp.where(good[..., None, None], gain, 0.0)
     return Regulator(linear.force, gain, good, linear.point, float(timestep))

@@ -19,6 +19,7 @@ __all__ = [
     "orientation_matrix",
     "quaternion_product",
     "rotate",
+    "rotate_wrench",
     "rotation_between",
     "turned",
 ]
@@ -74,6 +75,15 @@ def rotate(
     w, u = orientation[..., :1], orientation[..., 1:]
     t = 2 * cross(u, v)
     return v + (-w if inverse else w) * t + cross(u, t)
+
+
+def rotate_wrench(
+    orientation: Float[Array, "*batch o"], wrench: Float[Array, "*batch m"], inverse: bool = False
+) -> Float[Array, "*batch m"]:
+    """``diag(R, R) w``, or its inverse: force and torque both change axes."""
+    d = 2 if orientation.shape[-1] == 1 else 3
+    parts = (rotate(orientation, x, inverse) for x in (wrench[..., :d], wrench[..., d:]))
+    return jnp.concatenate(list(parts), axis=-1)
 
 
 def turned(

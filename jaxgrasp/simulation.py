@@ -20,6 +20,7 @@ import numpy as np
 
 from ._types import Array, Float
 from .dynamics import BodyState, RigidBody, gravity_vector, world_grasp_map
+from .geometry import applied
 from .grasp import Grasp
 from .rotations import rotate, rotation_between, turned
 
@@ -163,7 +164,7 @@ class MujocoPlant(eqx.Module):
         """The states (T, *batch) after each of T steps with the contact forces ``force[0]``, ``force[1]`` .."""
 
         def step(now: BodyState, f: Array) -> tuple[BodyState, BodyState]:
-            after = self.advance(now, _applied(world_grasp_map(grasp, now.orientation), f))
+            after = self.advance(now, applied(world_grasp_map(grasp, now.orientation), f))
             return after, after
 
         return jax.lax.scan(step, state, force)[1]
@@ -202,10 +203,6 @@ class MujocoPlant(eqx.Module):
 
 
 BATCHED = ("body_mass", "body_subtreemass", "body_inertia", "body_iquat")
-
-
-def _applied(matrix: Array, v: Array) -> Array:
-    return jnp.sum(matrix * v[..., None, :], axis=-1)
 
 
 def _principal(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

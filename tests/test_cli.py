@@ -148,12 +148,12 @@ def test_user_errors_are_one_line_and_exit_code_2(capsys, tmp_path, arguments, m
 
 
 def test_ctrl_c_says_how_to_go_on(capsys, monkeypatch, dtype):
-    from jaxgrasp import screening
+    from jaxgrasp import shards
 
     def interrupt(path, rows):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(screening, "_write_shard", interrupt)
+    monkeypatch.setattr(shards, "_write", interrupt)
     assert main(["screen", "mug", *SMALL, "--dtype", dtype]) == 130
     (line,) = capsys.readouterr().err.splitlines()
     assert "stopped" in line and "--resume" in line

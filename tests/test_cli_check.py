@@ -1,11 +1,17 @@
 """``jaxgrasp check`` as a user runs it."""
 
+import os
+import signal
+import subprocess
+import sys
+import time
+
 import jax
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from jaxgrasp import ControllabilityVerdict, Status
+from jaxgrasp import ControllabilityVerdict, Status, checking, shards
 from jaxgrasp.cli import main
 
 V = ControllabilityVerdict
@@ -19,11 +25,32 @@ def elsewhere(tmp_path, monkeypatch):
     return tmp_path
 
 
+def stop_before(monkeypatch, number):
+    """Ctrl-C instead of the shard of chunk ``number``."""
+    original = shards._write
+
+    def write(path, rows):
+        if path.name == f"{number:08d}.arrow":
+            raise KeyboardInterrupt
+        original(path, rows)
+
+    monkeypatch.setattr(shards, "_write", write)
+
+
 @pytest.mark.slow
-def test_grasps_of_the_mug_are_checked(capsys, tmp_path):
-    assert main(["check", "mug", "--mass", "0.3", "--fingers", "3", "--most", "60", "--row", "5"]) == 0
+def test_grasps_of_the_mug_are_checked(capsys, tmp_path, monkeypatch):
+    """60 grasps in chunks of 25, stopped after two of them and gone on with: the bytes of an uninterrupted run."""
+    words = ["check", "mug", "--mass", "0.3", "--fingers", "3", "--most", "60", "--chunk", "25", "--row", "5"]
+    assert main([*words, "-o", "whole.parquet"]) == 0
+    with monkeypatch.context() as patch:
+        stop_before(patch, 2)
+        assert main(words) == 130
+    assert "go on with the same command and --resume" in capsys.readouterr().err
+    assert main([*words, "--resume"]) == 0
     printed = capsys.readouterr().out
     assert "written to mug.check.parquet" in printed and "Row 5: " in printed and "recovered" in printed
+    assert "50 grasps were already done" in printed
+    assert (tmp_path / "mug.check.parquet").read_bytes() == (tmp_path / "whole.parquet").read_bytes()
     table = pq.read_table(tmp_path / "mug.check.parquet")
     verdict, status = table["verdict"].to_numpy(), table["status"].to_numpy()
     assert table["row"].to_pylist() == list(range(60))
@@ -40,6 +67,85 @@ def test_grasps_of_the_mug_are_checked(capsys, tmp_path):
     assert (use[steerable] <= 1 + 1e-9).all()
 
 
+# Chunks and shards, with something quick in place of the controllers ---------------------------------------
+
+
+def quick(run, contacts):
+    """Columns that depend on the grasp alone."""
+    x = contacts.position.sum((1, 2))
+    good = np.where(x > 0.3, 1, 4).astype(np.int32)
+    one = dict.fromkeys(("effort", "settling_time", "peak_force", "cone_use"), x)
+    twist, rank = np.repeat(x[:, None], 6, axis=1), np.full(len(x), 12.0)
+    columns = {"verdict": good, "status": good, "rank": rank, "weakest": twist, "recovered": good == 1}
+    return {"grasp_id": contacts.grasp_id, **columns, **one}
+
+
+QUICK = ["check", "mug", "--mass", "0.3", "--most", "10", "--chunk", "4"]
+
+
+def test_a_stopped_check_goes_on_where_it_was(capsys, tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(
+        checking, "_checked", lambda run, contacts: calls.append(len(contacts)) or quick(run, contacts)
+    )
+    assert main([*QUICK, "-o", "whole.parquet"]) == 0 and calls == [4, 4, 2]
+    whole = pq.read_table(tmp_path / "whole.parquet")
+    assert whole["row"].to_pylist() == whole["grasp_id"].to_pylist() == list(range(10))
+    with monkeypatch.context() as patch:
+        stop_before(patch, 1)
+        assert main(QUICK) == 130
+    parts = tmp_path / "mug.check.parquet.parts"
+    assert [x.name for x in parts.glob("*.arrow")] == ["00000000.arrow"]
+    assert not (tmp_path / "mug.check.parquet").exists()
+    assert main(QUICK) == 2 and main([*QUICK, "--resume", "--mass", "0.4"]) == 2
+    said = capsys.readouterr().err
+    assert "go on with --resume" in said and "belongs to another run: mass was 0.3, is now 0.4" in said
+    calls.clear()
+    assert main([*QUICK, "--resume"]) == 0 and calls == [4, 2]
+    assert "4 grasps were already done" in capsys.readouterr().out and not parts.exists()
+    assert (tmp_path / "mug.check.parquet").read_bytes() == (tmp_path / "whole.parquet").read_bytes()
+    calls.clear()
+    assert main([*QUICK, "--resume"]) == 0 and calls == []  # nothing left to do
+    assert "10 grasps were already done" in capsys.readouterr().out
+
+
+KILLED = """
+import sys, time
+sys.path.insert(0, {tests!r})
+from test_cli_check import quick
+from jaxgrasp import checking
+from jaxgrasp.cli import main
+def slow(run, contacts):
+    time.sleep(0.3)
+    return quick(run, contacts)
+checking._checked = slow
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_killed_check_goes_on_where_it_was(tmp_path, monkeypatch):
+    """Killed with SIGKILL once a shard is there."""
+    code = KILLED.format(tests=os.path.dirname(__file__))
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "JAX_PLATFORMS": "cpu"}
+    environment["JAX_ENABLE_X64"] = "1"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *QUICK], cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL
+    )
+    parts, deadline = tmp_path / "mug.check.parquet.parts", time.monotonic() + 120
+    while not list(parts.glob("*.arrow")) and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    assert list(parts.glob("*.arrow")) and not (tmp_path / "mug.check.parquet").exists()
+    monkeypatch.setattr(checking, "_checked", quick)
+    assert main([*QUICK, "--resume"]) == 0
+    assert main([*QUICK, "-o", "whole.parquet"]) == 0
+    assert (tmp_path / "mug.check.parquet").read_bytes() == (tmp_path / "whole.parquet").read_bytes()
+
+
+# Mistakes -------------------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
@@ -47,6 +153,7 @@ def test_grasps_of_the_mug_are_checked(capsys, tmp_path):
         (["mug", "--mass", "0.3", "--gravity", "0,0,0"], "not all 0"),
         (["mug", "--mass", "0.3", "--gravity", "down"], "--gravity must be three numbers"),
         (["mug", "--mass", "0.3", "--most", "0"], "--most must be at least 1"),
+        (["mug", "--mass", "0.3", "--chunk", "0"], "--chunk must be at least 1"),
         (["mug", "--mass", "0.3", "--row", "300"], "there is no row 300"),
         (["nothing.stl", "--mass", "0.3"], "no such file"),
         (["mug", "--mass", "0.3", "--torsion", "0.1"], "no torsion"),

@@ -86,6 +86,7 @@ FLOORS = [
     "formats.force_table",
     "run",
     "summary",
+    "shards",
     "screening",
     "drawing",
     "report",

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import jaxgrasp as jg
-from jaxgrasp import meshes, screening
+from jaxgrasp import meshes, screening, shards
 from jaxgrasp.errors import UserError
 from jaxgrasp.formats.parquet import ContactFile
 from jaxgrasp.run import Request, prepare
@@ -115,7 +115,7 @@ def test_rows_do_not_depend_on_the_chunk(whole, tmp_path, dtype):
 
 def interrupted(tmp_path, dtype, monkeypatch, after=1, **options):
     """A run that stops as Ctrl-C would, after so many shards."""
-    original, count = screening._write_shard, [0]
+    original, count = shards._write, [0]
 
     def write(path, rows):
         if count[0] == after:
@@ -124,7 +124,7 @@ def interrupted(tmp_path, dtype, monkeypatch, after=1, **options):
         original(path, rows)
 
     with monkeypatch.context() as patch:
-        patch.setattr(screening, "_write_shard", write)
+        patch.setattr(shards, "_write", write)
         with pytest.raises(KeyboardInterrupt):
             screen(prepare(request(tmp_path, dtype, **options)))
     return tmp_path / "a.parquet.parts"
@@ -184,13 +184,13 @@ def test_sigkill_and_resume(whole, tmp_path, dtype):
 
 SLOW_SCREEN = """
 import sys, time
-from jaxgrasp import meshes, screening
+from jaxgrasp import meshes, shards
 from jaxgrasp.cli import main
-write = screening._write_shard
+write = shards._write
 def slowly(path, rows):
     write(path, rows)
     time.sleep(0.5)
-screening._write_shard = slowly
+shards._write = slowly
 sys.exit(main(sys.argv[1:]))
 """
 
@@ -328,7 +328,7 @@ def test_a_full_disk_is_one_line_and_keeps_the_shards(tmp_path, dtype, monkeypat
     def full(path, rows):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(screening, "_write_shard", full)
+    monkeypatch.setattr(shards, "_write", full)
     with pytest.raises(UserError, match="No space left on device"):
         screen(prepare(request(tmp_path, dtype)))
     assert list(tmp_path.iterdir()) == []
