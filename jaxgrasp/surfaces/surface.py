@@ -8,7 +8,7 @@ curves and surfaces, 1976, sections 3.2 and 3.3.
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -130,24 +130,17 @@ class Surface(eqx.Module):
         on, normal = self._contact(point)
         tangents = jnp.stack(contact_frame(normal), axis=-1)
         shape = -jax.jacfwd(self._normal_on)(on)  # along the surface any continuation has the same derivative
-        block = tangents.T @ shape @ tangents
+        block = jnp.sum(tangents[:, :, None] * jnp.sum(shape[:, :, None] * tangents, axis=1)[:, None], axis=0)
         mean, half = (block[0, 0] + block[1, 1]) / 2, (block[0, 0] - block[1, 1]) / 2
         _, spread = unit_or(jnp.stack([half, (block[0, 1] + block[1, 0]) / 2]), jnp.zeros(2, point.dtype))
         return jnp.stack([mean - spread, mean + spread])
 
-    def _each(self, function: Callable[..., Any], signature: str, point: Any) -> Any:
-        point = _points(point, self.centre.dtype)
-
-        def lane(p: Array) -> Any:
-            finite = jnp.isfinite(p).all()
-            answer = function(jnp.where(finite, p, self.centre + self.radius))
-            return jax.tree.map(lambda a: jnp.where(finite, a, jnp.full_like(a, jnp.nan)), answer)
-
-        return jnp.vectorize(lane, signature=f"(d)->{signature}")(point)
+    def _answer(self, question: str, shape: str, point: Any) -> Any:
+        return _lanes(self, question, shape, _points(point, self.centre.dtype))
 
     def contact(self, point: Any) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch 3"]]:
         """``project`` and ``normal`` at the price of one of them."""
-        return self._each(self._contact, "(d),(d)", point)
+        return self._answer("_contact", "(d),(d)", point)
 
     def project(self, point: Any) -> Float[Array, "*batch 3"]:
         """``argmin_x |x - p|`` over the surface, m; a fixed one of them where several are nearest."""
@@ -159,7 +152,7 @@ class Surface(eqx.Module):
 
     def distance(self, point: Any) -> Float[Array, "*batch"]:
         """``+-|p - project(p)|``: signed distance, m, negative inside."""
-        return self._each(self._distance, "()", point)
+        return self._answer("_distance", "()", point)
 
     def curvature(self, point: Any) -> Float[Array, "*batch 2"]:
         """Principal curvatures at ``project(point)``, 1/m, the smaller first; positive where convex (1/r on a ball).
@@ -167,11 +160,11 @@ class Surface(eqx.Module):
         The eigenvalues of ``-T^T (dn/dp) T`` for the inward normal n and tangents T. Their own derivatives are those
         of simple eigenvalues, and 0 in the difference of two equal ones.
         """
-        return self._each(self._curvature, "(c)", point)
+        return self._answer("_curvature", "(c)", point)
 
     def edge_distance(self, point: Any) -> Float[Array, "*batch"]:
         """Distance of ``project(point)`` to the nearest sharp edge, m; infinite where the surface has none."""
-        return self._each(self._edge_distance, "()", point)
+        return self._answer("_edge_distance", "()", point)
 
     @abc.abstractmethod
     def sample(self, seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -179,3 +172,15 @@ class Surface(eqx.Module):
 
         On the host, in float64; the same seed gives the same bytes. ValueError for a negative seed or count.
         """
+
+
+@partial(jax.jit, static_argnums=(1, 2))
+def _lanes(surface: Surface, question: str, shape: str, point: Array) -> Any:
+    """One compilation a shape: a call outside jit would otherwise compile its loops anew each time."""
+
+    def lane(p: Array) -> Any:
+        finite = jnp.isfinite(p).all()
+        answer = getattr(surface, question)(jnp.where(finite, p, surface.centre + surface.radius))
+        return jax.tree.map(lambda a: jnp.where(finite, a, jnp.full_like(a, jnp.nan)), answer)
+
+    return jnp.vectorize(lane, signature=f"(d)->{shape}")(point)
