@@ -30,7 +30,10 @@ def rounding(dtype, size=1.0):
     return 4096 * unit_roundoff(dtype) * size
 
 
-@pytest.fixture(scope="module", params=SHAPES)
+NAMES = [pytest.param(name, marks=[pytest.mark.slow] * (name == "superquadric")) for name in SHAPES]
+
+
+@pytest.fixture(scope="module", params=NAMES)
 def shape(request):
     return SHAPES[request.param]()
 
@@ -57,14 +60,33 @@ def around(surface, count, seed=0, reach=0.3):
     return point + step * normal
 
 
-@jax.jit
+def by_rows(function):
+    """``function(surface, points)`` in NumPy, 512 rows at a time: one compilation a surface."""
+    compiled = jax.jit(function)
+
+    def answer(surface, point):
+        flat = np.asarray(point, np.float64)
+        rows = -(-len(flat) // 512) * 512
+        flat = np.concatenate([flat, np.repeat(flat[-1:], rows - len(flat), axis=0)])
+        parts = [compiled(surface, flat[i : i + 512]) for i in range(0, rows, 512)]
+        return tuple(np.concatenate(part)[: len(point)] for part in zip(*parts, strict=True))
+
+    return answer
+
+
+@by_rows
 def everything(surface, point):
     return (*surface.contact(point), surface.distance(point), surface.edge_distance(point))
 
 
-@jax.jit
+@by_rows
 def slopes(surface, point):
     return jax.vmap(jax.jacfwd(surface.contact))(point)
+
+
+@by_rows
+def bends(surface, point):
+    return surface.curvature(point), jax.vmap(jax.grad(surface.distance))(point)
 
 
 def differences(function, x, step):
@@ -132,7 +154,7 @@ def test_derivatives_are_those_of_differences(shape):
     for i in range(len(point)):
         assert np.abs(dx[i] - wanted[i, :, 3 * i : 3 * i + 3]).max() < 1e-6
         assert np.abs(dn[i] - normals[i, :, 3 * i : 3 * i + 3]).max() < 1e-6 / 0.005
-    slope = jax.vmap(jax.grad(shape.distance))(jnp.asarray(point))
+    _, slope = bends(shape, point)
     assert np.abs(slope + everything(shape, point)[1]).max() < 1e-9
 
 
@@ -142,7 +164,7 @@ def test_on_the_surface_the_derivative_projects_onto_the_tangent_plane(shape):
     assert np.abs(dx - (np.eye(3) - normal[:, :, None] * normal[:, None])).max() < 1e-9
     assert np.abs(dn - np.swapaxes(dn, 1, 2)).max() < 1e-7  # the shape operator is symmetric
     assert np.abs(np.einsum("nij,ni->nj", dn, normal)).max() < 1e-7
-    curvature = np.asarray(jax.jit(lambda s, p: s.curvature(p))(shape, point))
+    curvature, _ = bends(shape, point)
     expected = -np.linalg.eigvalsh(np.asarray(dn))[:, ::-1]
     expected = np.sort(np.take_along_axis(expected, np.argsort(np.abs(expected))[:, 1:], axis=1), axis=1)
     assert np.abs(curvature - expected).max() < 1e-6
@@ -217,12 +239,16 @@ def test_shapes_scale_and_move(shape):
         (lambda t: surfaces.RoundedBox(t[:3], t[3]), [0.06, 0.04, 0.03, 0.01]),
         (lambda t: surfaces.Cylinder(t[0], t[1], t[2]), [0.03, 0.06, 0.01]),
         (lambda t: surfaces.Ellipsoid(t[:3]), [0.03, 0.05, 0.08]),
-        (lambda t: surfaces.Superquadric(t[:3], t[3:5]), [0.05, 0.04, 0.06, 0.4, 0.6]),
+        pytest.param(
+            lambda t: surfaces.Superquadric(t[:3], t[3:5]),
+            [0.05, 0.04, 0.06, 0.4, 0.6],
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=list(SHAPES),
 )
 def test_derivatives_by_parameters(make, start):
-    point = jnp.asarray([[0.05, 0.045, 0.03], [0.03, 0.05, -0.07]])
+    point = jnp.asarray([[0.052, 0.045, 0.03], [0.03, 0.05, -0.07]])
     value = jax.jit(lambda t: jnp.concatenate([make(t).project(point), make(t).normal(point) / 10]))
     slope = jax.jit(jax.jacrev(value))(jnp.asarray(start))
     wanted = differences(value, np.asarray(start), 1e-7)
@@ -256,13 +282,14 @@ def test_finite_where_nearest_points_are_many(shape):
     offset = np.array([[0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 0], [0, 0, 1e-3], [0, 0, 0.5], [0, 0.5, 0]])
     point = np.asarray(shape.centre) + offset
     x, n, _, _ = everything(shape, point)
-    assert np.abs(shape.distance(x)).max() < 1e-9
+    assert np.abs(everything(shape, x)[2]).max() < 1e-9
     assert np.linalg.norm(n, axis=1) == pytest.approx(1, abs=1e-9)
     for slope in slopes(shape, point):
         assert np.isfinite(slope).all()
 
 
-def test_any_batch_shape(shape):
+def test_any_batch_shape():
+    shape = SHAPES["ellipsoid"]()
     point = jnp.asarray(around(shape, 6)).reshape(2, 3, 3)
     x = shape.project(point)
     assert x.shape == (2, 3, 3) and shape.distance(point).shape == (2, 3)
@@ -312,7 +339,7 @@ def test_a_point_and_a_triangle():
     assert square == pytest.approx([9, 2, 25, 1, 4 / 5, 0], abs=1e-15)
     assert weight[0] == pytest.approx([0.5, 0.25, 0.25]) and weight[1].tolist() == [1, 0, 0]
     assert weight[2].tolist() == [0.5, 0.5, 0] and weight[3].tolist() == [0, 1, 0]
-    assert weight[4] == pytest.approx([0, 0.6, 0.4]) and weight[4, 0] == 0
+    assert weight[4] == pytest.approx([0, 0.4, 0.6]) and weight[4, 0] == 0
 
 
 @pytest.mark.parametrize("name", ["mug", "box"])
@@ -394,7 +421,7 @@ def test_projected_points_lie_on_the_mesh(mug):
     assert np.median(exact.distance) < 5e-4 * float(mug.radius)
     angle = np.degrees(np.arccos(np.clip(np.sum(n * exact.smooth_normal, axis=1), -1, 1)))
     assert np.quantile(angle[away], 0.99) < 3 and np.median(angle) < 0.5
-    assert np.abs(mug.distance(x)).max() < 1e-5
+    assert np.abs(everything(mug, x)[2]).max() < 1e-5
     assert np.abs(np.abs(distance) - mug.project_exact(point).distance).max() < 0.35 * cell
 
 
@@ -404,7 +431,7 @@ def test_a_faceted_ball_has_the_normals_and_curvature_of_a_ball(ball):
     radial = -x / np.linalg.norm(x, axis=1, keepdims=True)
     angle = np.degrees(np.arccos(np.clip(np.sum(n * radial, axis=1), -1, 1)))
     assert angle.max() < 0.2  # the facets' own are off by 2.7 degrees
-    curvature = np.asarray(jax.jit(lambda s, p: s.curvature(p))(ball, point))
+    curvature, _ = bends(ball, point)
     assert np.median(curvature) == pytest.approx(25, rel=0.01) and np.abs(curvature - 25).max() < 3
     assert np.isinf(edge).all() and ball.warnings == ()
     assert float(ball.radius) == pytest.approx(0.04, rel=1e-6)
@@ -420,14 +447,14 @@ def test_derivatives_of_a_mesh_are_those_of_differences(mug):
     for i in range(len(point)):
 
         def near(p, which):
-            return everything(mug, np.tile(p, (len(point), 1)))[which][0]
+            return everything(mug, p[None])[which][0]
 
         for slope, which, unit in ((dx, 0, 1.0), (dn, 1, 1 / cell)):
             wanted = differences(lambda p, which=which: near(p, which), point[i], 1e-8)
             assert np.abs(slope[i] - wanted).max() < 1e-5 * unit, (i, which)
     x = np.asarray(value[0])
     dx, _ = slopes(mug, x)
-    surface_normal = np.asarray(jax.vmap(jax.grad(mug.distance))(jnp.asarray(x)))
+    _, surface_normal = bends(mug, x)
     surface_normal /= np.linalg.norm(surface_normal, axis=1, keepdims=True)
     wanted = np.eye(3) - surface_normal[:, :, None] * surface_normal[:, None]
     assert np.abs(dx - wanted).max() < 1e-6
@@ -437,10 +464,10 @@ def test_edges_of_a_box(block):
     """Known distances to the nearest edge, and the centre, radius and sign of a box."""
     cell = float(block.grid.spacing)
     point = np.array([[0.06, 0.0, 0.0], [0.06, 0.03, 0.0], [0.02, 0.01, 0.03], [-0.05, -0.04, 0.01]])
-    distance = np.asarray(block.edge_distance(point))
+    distance = everything(block, point)[3]
     assert distance == pytest.approx([0.03, 0.01, 0.03, 0.01], abs=0.1 * cell)
     assert float(block.radius) == pytest.approx(np.linalg.norm([0.06, 0.04, 0.03]), rel=1e-6)
-    assert block.distance([[0.0, 0, 0], [0.08, 0, 0], [1.0, 0, 0]]) == pytest.approx(
+    assert everything(block, [[0.0, 0, 0], [0.08, 0, 0], [1.0, 0, 0]])[2] == pytest.approx(
         [-0.03, 0.02, 0.94], abs=0.2 * cell
     )
     slope = jax.grad(block.edge_distance)(jnp.asarray([0.06, 0.03, 0.0]))
@@ -462,7 +489,7 @@ def test_the_sign_is_the_winding_numbers(mug):
     random = np.random.default_rng(3)
     low, high = mug.triangles.vertices.min(axis=0), mug.triangles.vertices.max(axis=0)
     point = random.uniform(low - 0.003, high + 0.003, (150, 3)) + mug.triangles.middle
-    distance = np.asarray(mug.distance(point))
+    distance = everything(mug, point)[2]
     sure = np.abs(distance) > 0.1 * float(mug.grid.spacing)
     inside = winding(mug.triangles.corner + mug.triangles.middle, point) > 0.5
     assert np.array_equal(distance[sure] < 0, inside[sure]) and inside[sure].sum() > 10
@@ -489,7 +516,7 @@ def test_points_far_outside_and_without_numbers(block):
     x, n, distance, edge = everything(block, point)
     for value in (x, n, distance, edge):
         assert np.isfinite(value[::2]).all() and np.isnan(value[1]).all() and np.isfinite(value[3]).all()
-    assert np.abs(block.distance(x[3])) < 1e-12
+    assert np.abs(everything(block, x)[2][3]) < 1e-12
     dx, dn = slopes(block, point)
     assert np.isfinite(dx).all() and np.isfinite(dn).all()
 

@@ -165,8 +165,13 @@ class Ellipsoid(Gauge):
         region step, 1983.
         """
         a = self.semiaxes
-        # Off the plane across the shortest axis, where two points can be nearest.
-        least = 1e-9 * a * jax.nn.one_hot(jnp.argmin(a), 3, dtype=a.dtype)
+        # Inside, off the plane across the shortest axis, where two points can be nearest.
+        least = (
+            (self.gauge(point) < 1).astype(a.dtype)
+            * 1e-9
+            * a
+            * jax.nn.one_hot(jnp.argmin(a), 3, dtype=a.dtype)
+        )
         point = jnp.where(jnp.abs(point) < least, least, point)
 
         def newton(_: Any, t: Array) -> Array:

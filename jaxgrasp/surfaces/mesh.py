@@ -164,7 +164,7 @@ class MeshSurface(Surface):
             raise ValueError(f"points must have shape (*batch, 3), got {given.shape}")
         batch, t = given.shape[:-1], self.triangles
         flat = given.reshape(-1, 3)
-        finite = np.isfinite(flat).all(axis=1)
+        finite = np.asarray(np.isfinite(flat).all(axis=1))
         distance, face, weight = self.search.nearest(np.where(finite[:, None], flat, t.middle) - t.middle)
 
         def shaped(values: np.ndarray, missing: float = np.nan) -> np.ndarray:
