@@ -400,6 +400,8 @@ def test_exact_projection_of_batches_and_of_no_number(block):
     assert nearest.face[1, 2] == -1 and np.isnan(nearest.point[1, 2]).all()
     assert nearest.point[0] == pytest.approx(np.tile([0.06, 0, 0], (3, 1)), abs=1e-15)
     assert nearest.normal[0] == pytest.approx(np.tile([-1, 0, 0], (3, 1)), abs=1e-15)
+    one = block.project_exact([0.07, 0.0, 0.0])
+    assert one.point.shape == (3,) and one.face.shape == () and one.distance == pytest.approx(0.01)
     assert block.project_exact(np.zeros((0, 3))).point.shape == (0, 3)
     with pytest.raises(ValueError, match="shape"):
         block.project_exact([1.0, 2.0])

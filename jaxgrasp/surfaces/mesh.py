@@ -169,7 +169,7 @@ class MeshSurface(Surface):
 
         def shaped(values: np.ndarray, missing: float = np.nan) -> np.ndarray:
             kept = finite.reshape(-1, *[1] * (values.ndim - 1))
-            return np.where(kept, values, missing).reshape(*batch, *values.shape[1:])
+            return np.where(kept, values, missing).reshape((*batch, *values.shape[1:]))
 
         return NearestPoint(
             shaped(t.at(face, weight) + t.middle),
