@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MeshSurface", "NearestPoint"]
 
-STEPS = 6  # Newton steps of a projection: from within the band it converges to rounding in four
+STEPS = 6  # Newton steps of a projection: from within the band they end at rounding, thin parts apart
 LEAST_SLOPE = 0.25  # of phi, squared, that a step divides by; 1 on the surface
 PROBES = 4000  # points of the mesh at which a new grid is tried
 MOST_LOST = 0.25  # share of them that may be lost before the grid is refused
