@@ -3,6 +3,7 @@
 Names follow the chapter "Wrench Resistant Grasps"; wrench resistance is what others call force closure.
 """
 
+from . import surfaces
 from .certificate import check_certificate
 from .closed_loop import ClosedLoop, close_loop
 from .contacts import ContactModel, Frictionless, HardFinger, SoftFinger
@@ -153,6 +154,8 @@ __all__ = [
     "Gains",
     "Reference",
     "ControlStatus",
+    # surfaces to put contacts on
+    "surfaces",
     # answers and their proofs
     "Status",
     "check_certificate",

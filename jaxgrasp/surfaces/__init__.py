@@ -1,0 +1,49 @@
+"""Surfaces on which contacts are moved by gradients: nearest point, inward normal, curvature, sharp edges, samples.
+
+``x = surface.project(p)`` is differentiable, with ``dx/dp = T T^T`` on the surface; ``surface.normal`` turns with the
+shape operator. Shapes in closed form or by Newton's method; meshes by a spline through their signed distance inside
+``jit`` and by their triangles outside.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .gauge import Ellipsoid, Superquadric
+from .mesh import MeshSurface, NearestPoint
+from .rounded import Cylinder, RoundedBox, Sphere
+from .surface import Surface
+
+if TYPE_CHECKING:
+    from ..meshes import Body
+
+__all__ = [
+    "Surface",
+    "Sphere",
+    "Ellipsoid",
+    "Superquadric",
+    "RoundedBox",
+    "Cylinder",
+    "MeshSurface",
+    "NearestPoint",
+    "of",
+]
+
+
+def of(source: str | Path | Body, unit: str = "m", com: Any = None, resolution: int = 96) -> MeshSurface:
+    """The surface of a built-in object, a mesh file or a ``Body``, in m and in the file's frame.
+
+    unit        m, cm, mm or in: what one unit of the file's numbers is; a body is in metres already
+    com         (3,) centre of mass in m, by default computed from the mesh
+    resolution  nodes of the distance grid along the longest side
+
+    What ``jaxgrasp.meshes.load`` found doubtful is in ``warnings`` too. UserError as there and in ``MeshSurface``.
+    """
+    from ..meshes import Body, load
+
+    if isinstance(source, Body):
+        if unit != "m" or com is not None:
+            raise ValueError("a Body has its unit and its centre of mass: give those to jaxgrasp.meshes.load")
+        return MeshSurface.from_body(source, resolution)
+    return MeshSurface.from_body(load(source, unit, com), resolution)
