@@ -17,6 +17,7 @@ from .controllability import (
 )
 from .controllability_words import explain_controllability
 from .criteria import Criterion, Gentlest, LeastNorm, Robust, SmallestSum, SumOfSquares
+from .critical_friction import CriticalFriction, critical_friction, friction_sweep, with_friction_factor
 from .dynamics import (
     BodyState,
     RigidBody,
@@ -27,6 +28,7 @@ from .dynamics import (
     mass_matrix,
     world_grasp_map,
 )
+from .epsilon import EpsilonQuality, epsilon_quality
 from .equilibrium import (
     Equilibrium,
     EquilibriumKind,
@@ -46,6 +48,7 @@ from .grasp import (
     internal_force_part,
     null_space,
 )
+from .guaranteed_radius import GuaranteedRadius, guaranteed_radius
 from .linearization import Linearization, OperatingPoint, linearize
 from .lmi import (
     FrictionLMI,
@@ -63,6 +66,7 @@ from .lmi import (
     second_order_cone_lmi,
 )
 from .lmi_forces import LMIForces, lmi_forces
+from .measures import TaskQuality, grasp_isotropy, grasp_volume, task_quality
 from .regulator import Regulator, regulator
 from .resistance import WrenchResistance, wrench_resistance
 from .simulation import MujocoPlant, mujoco_model, mujoco_plant
@@ -125,6 +129,19 @@ __all__ = [
     "ResistibleWrenches",
     "lmi_forces",
     "LMIForces",
+    # quality: how good is the grasp
+    "epsilon_quality",
+    "EpsilonQuality",
+    "critical_friction",
+    "CriticalFriction",
+    "friction_sweep",
+    "with_friction_factor",
+    "guaranteed_radius",
+    "GuaranteedRadius",
+    "task_quality",
+    "TaskQuality",
+    "grasp_isotropy",
+    "grasp_volume",
     # 11.4 dynamics and controllability
     "RigidBody",
     "BodyState",

@@ -45,6 +45,7 @@ FLOORS = [
     "certificate.rebuilt",
     "certificate.resistance",
     "certificate.forces",
+    "certificate.epsilon",
     "certificate",
     # the questions
     "lanes",
@@ -60,6 +61,14 @@ FLOORS = [
     "sensitivity",
     "forces",
     "equilibrium",
+    # quality
+    "effort",
+    "polytope",
+    "weakest",
+    "epsilon",
+    "critical_friction",
+    "guaranteed_radius",
+    "measures",
     "tracing",
     # motion
     "rotations",

@@ -93,7 +93,10 @@ def centred(program: ConvexProgram, point: Point, solve: Callable[[Motion], Moti
     mean = cone_sum(exists * inner(u, z)) / cone_sum(exists)
     det = jnp.where(exists > 0, (u[0] - tail_size(u)) * (u[0] + tail_size(u)), one)
     pull = exists * mean / det
-    target = (pull * u[0] - exists * z[0], *(-pull * a - exists * b for a, b in zip(u[1:], z[1:], strict=True)))
+    target = (
+        pull * u[0] - exists * z[0],
+        *(-pull * a - exists * b for a, b in zip(u[1:], z[1:], strict=True)),
+    )
     x = solve(Motion(target, jnp.zeros_like(point.y), None, None))
     dz = program.gradient(x.u, x.y, jnp.zeros_like(mean))
     new_u = tuple(a + exists * b for a, b in zip(u, x.u, strict=True))

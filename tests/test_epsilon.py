@@ -1,0 +1,244 @@
+"""The Ferrari-Canny quality: closed forms, Qhull's pyramids, optimal forces, invariances, derivatives, proofs."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+
+import jaxgrasp as jg
+from jaxgrasp import Status
+from jaxgrasp.effort import effort_map, extreme_force, torque_lengths
+
+
+def ball(rng, count, k, tilt=0.3):
+    """Hard fingers on a unit sphere with tilted normals: position, normal, friction."""
+    position = rng.normal(size=(count, k, 3))
+    position /= np.linalg.norm(position, axis=-1, keepdims=True)
+    return position, -position + tilt * rng.normal(size=position.shape), rng.uniform(0.3, 0.8, (count, k))
+
+
+@pytest.fixture(scope="module")
+def grasp():
+    position, normal, friction = ball(np.random.default_rng(0), 64, 4)
+    return jg.Grasp(position, normal, jg.HardFinger(friction))
+
+
+@pytest.fixture(scope="module")
+def answer(grasp):
+    return jg.epsilon_quality(grasp, certificate=True)
+
+
+def pyramid_epsilon(A, edges, outer):
+    """Qhull's ball in the hull of pyramids inside, or around, the friction cones of A (k, 6, 3)."""
+    angle = 2 * np.pi * np.arange(edges) / edges
+    reach = 1 / np.cos(np.pi / edges) if outer else 1.0
+    points = [
+        a[:, 0] + reach * (np.cos(angle)[:, None] * a[:, 1] + np.sin(angle)[:, None] * a[:, 2]) for a in A
+    ]
+    return float(-ConvexHull(np.concatenate(points)).equations[:, -1].max())
+
+
+def test_the_bracket_is_narrow_and_opens_only_where_resistant(answer):
+    resistant = np.asarray(answer.status) == Status.RESISTANT
+    assert 20 < resistant.sum() < 60
+    width = np.asarray(answer.width)
+    assert (width[resistant] <= 0.0101).all()
+    assert np.asarray(answer.smooth)[resistant].mean() > 0.9
+    assert (np.asarray(answer.lower)[~resistant] == 0).all()
+    refuted = np.asarray(answer.status) == Status.NOT_RESISTANT
+    assert refuted.sum() > 10
+    assert (np.asarray(answer.upper)[refuted] == 0).all()
+
+
+def test_the_checker_accepts_and_finds_every_fault(grasp, answer):
+    resistant = np.asarray(answer.status) == Status.RESISTANT
+    assert jg.check_certificate(grasp, answer).all()
+    faults = [
+        eqx.tree_at(lambda q: q.lower, answer, answer.lower * 1.0001),
+        eqx.tree_at(lambda q: q.upper, answer, answer.upper * 0.9999),
+        eqx.tree_at(lambda q: q.forces, answer, answer.forces * 1.001),
+        eqx.tree_at(lambda q: q.facets, answer, answer.facets.at[:, 3].set(-1)),
+        eqx.tree_at(lambda q: q.facets, answer, answer.facets.at[:, 3].set(answer.facets[:, 4])),
+        eqx.tree_at(lambda q: q.direction, answer, -answer.direction),
+        eqx.tree_at(lambda q: q.direction, answer, answer.direction * jnp.nan),
+    ]
+    for fault in faults:
+        assert not jg.check_certificate(grasp, fault)[resistant].any()
+
+
+def test_pyramids_inside_and_outside_agree(grasp, answer):
+    A = np.asarray(effort_map(grasp, torque_lengths(grasp)))
+    chosen = np.flatnonzero(np.asarray(answer.status) == Status.RESISTANT)[:6]
+    for i in chosen:
+        inner, outer = pyramid_epsilon(A[i], 16, False), pyramid_epsilon(A[i], 16, True)
+        assert inner <= float(answer.upper[i]) * (1 + 1e-9)
+        assert float(answer.lower[i]) <= outer * (1 + 1e-9)
+
+
+@pytest.mark.slow
+def test_a_hundred_grasps_against_pyramids_of_32_edges():
+    rng = np.random.default_rng(1)
+    position, normal, friction = ball(rng, 400, 4)
+    grasp = jg.Grasp(position, normal, jg.HardFinger(friction))
+    q = jg.epsilon_quality(grasp)
+    resistant = np.flatnonzero(np.asarray(q.status) == Status.RESISTANT)
+    A = np.asarray(effort_map(grasp, torque_lengths(grasp)))
+    assert len(resistant) > 100
+    assert np.mean(np.asarray(q.width)[resistant] <= 0.01) >= 0.99
+    for i in resistant[:100]:
+        inner, outer = pyramid_epsilon(A[i], 32, False), pyramid_epsilon(A[i], 32, True)
+        assert inner <= float(q.upper[i]) * (1 + 1e-9)
+        assert float(q.lower[i]) <= outer * (1 + 1e-9)
+
+
+def two_planar(mu):
+    """Opposite fingers at (-1, 0) and (1, 0)."""
+    position = np.array([[-1.0, 0.0], [1.0, 0.0]])
+    return jg.Grasp(position, -position, jg.HardFinger(mu))
+
+
+@pytest.mark.parametrize("mu", [0.2, 1.0])
+def test_two_opposite_planar_fingers(mu):
+    """W is the tetrahedron of (1, +-mu, -+mu), (-1, +-mu, +-mu): its faces lie at mu / sqrt(mu^2 + 2)."""
+    q = jg.epsilon_quality(two_planar(mu), certificate=True)
+    exact = mu / np.sqrt(mu**2 + 2)
+    assert float(q.lower) == pytest.approx(exact, rel=1e-9)
+    assert float(q.upper) == pytest.approx(exact, rel=1e-9)
+    assert jg.check_certificate(two_planar(mu), q)
+    # With every force up to 1 both edges of both cones can push at once: twice the L1 ball or more.
+    both = jg.epsilon_quality(two_planar(mu), "Linf", certificate=True)
+    assert float(both.lower) >= exact * (1 - 1e-9)
+    assert jg.check_certificate(two_planar(mu), both)
+
+
+def test_linf_ball_is_resisted_and_no_larger_one():
+    """The lower ball by optimal forces of another solver of ours, the upper bound by 10^5 support directions."""
+    rng = np.random.default_rng(3)
+    angle = np.sort(rng.uniform(0, 2 * np.pi, (40, 4)), axis=-1)
+    position = np.stack([np.cos(angle), np.sin(angle)], -1)
+    normal = -position + 0.3 * rng.normal(size=position.shape)
+    grasp = jg.Grasp(position, normal, jg.HardFinger(0.4))
+    q = jg.epsilon_quality(grasp, "Linf", certificate=True)
+    assert jg.check_certificate(grasp, q).all()
+    resistant = np.flatnonzero(np.asarray(q.status) == Status.RESISTANT)
+    assert len(resistant) >= 20
+    A = effort_map(grasp, torque_lengths(grasp))
+    direction = rng.normal(size=(100_000, 3))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    least = jax.jit(
+        lambda a, on: jnp.min(jax.vmap(lambda d: extreme_force(a, on, "Linf", d)[0])(jnp.asarray(direction)))
+    )
+    for i in resistant:
+        seen = float(least(A[i], grasp.active[i]))
+        assert float(q.lower[i]) <= seen * (1 + 1e-9)
+        assert float(q.upper[i]) <= seen * (1 + 1e-9)  # the weakest of 10^5 directions is no weaker
+    length = np.asarray(q.torque_scale)[resistant, None, None]
+    others = np.broadcast_to(direction[:300], (len(resistant), 300, 3))
+    loads = np.concatenate([-np.asarray(q.direction)[resistant][:, None], others], 1)
+    loads = (
+        loads
+        * np.asarray(q.lower)[resistant, None, None]
+        * np.concatenate([np.ones_like(length), np.ones_like(length), length], -1)
+    )
+    out = jg.task_quality(grasp[resistant], loads, "Linf")
+    assert (np.asarray(out.effort) <= 1 + 1e-6).all()
+    assert (np.asarray(out.effort)[:, 0] >= 0.98).all()  # the worst wrench takes it all
+
+
+def test_nothing_depends_on_axes_order_or_units(grasp, answer):
+    chosen = np.flatnonzero(np.asarray(answer.status) == Status.RESISTANT)[:10]
+    part = grasp[chosen]
+    rotation, _ = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))
+    rotation = rotation * np.sign(np.linalg.det(rotation))
+    position, normal = np.asarray(part.position), np.asarray(part.normal)
+    friction = np.asarray(part.model.friction_coefficient)
+    order = [2, 0, 3, 1]
+    turned = jg.Grasp(position @ rotation.T, normal @ rotation.T, part.model)
+    permuted = jg.Grasp(position[:, order], normal[:, order], jg.HardFinger(friction[:, order]))
+    larger = jg.Grasp(position * 1e3, normal * 7.0, part.model)
+    for other in (turned, permuted, larger):
+        q = jg.epsilon_quality(other)
+        both = np.asarray(q.smooth) & np.asarray(answer.smooth)[chosen]
+        assert both.sum() >= 8
+        np.testing.assert_allclose(
+            np.asarray(q.upper)[both], np.asarray(answer.upper)[chosen][both], rtol=1e-8
+        )
+        assert (np.asarray(q.lower) <= np.asarray(answer.upper)[chosen] * (1 + 1e-9)).all()
+
+
+def test_derivatives_against_differences(grasp, answer):
+    chosen = np.flatnonzero((np.asarray(answer.status) == Status.RESISTANT) & np.asarray(answer.smooth))[:8]
+    part = grasp[chosen]
+    x = (part.position, part.normal, part.model.friction_coefficient)
+
+    def answer_at(position, normal, friction):
+        return jg.epsilon_quality(jg.Grasp(position, normal, jg.HardFinger(friction)), torque_scale=1.0)
+
+    gradient = jax.grad(lambda *a: jnp.sum(answer_at(*a).upper), argnums=(0, 1, 2))(*x)
+    rng, h = np.random.default_rng(5), 1e-4
+    for w in range(3):
+        d = rng.normal(size=x[w].shape)
+        near = [answer_at(*[y + t * h * d if i == w else y for i, y in enumerate(x)]) for t in (-2, -1, 1, 2)]
+        a, b, c, e = (np.asarray(q.upper) for q in near)
+        difference = (8 * (c - b) - (e - a)) / (12 * h)
+        fine = np.all([np.asarray(q.smooth) for q in near], axis=0)
+        assert fine.sum() >= 5
+        slope = np.sum(np.asarray(gradient[w]) * d, axis=tuple(range(1, d.ndim)))
+        np.testing.assert_allclose(slope[fine], difference[fine], rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_jit_and_vmap_give_the_same_bits_and_bad_lanes_stay_alone(grasp, answer):
+    eager = jg.epsilon_quality(grasp[:8])
+    traced = jax.jit(jg.epsilon_quality)(grasp[:8])
+    mapped = jax.vmap(jg.epsilon_quality)(grasp[:8])
+    for other in (traced, mapped):
+        np.testing.assert_allclose(other.upper, eager.upper, rtol=1e-9)
+        np.testing.assert_allclose(other.lower, eager.lower, rtol=1e-9)
+    np.testing.assert_array_equal(np.asarray(eager.upper), np.asarray(answer.upper)[:8])
+    position = np.asarray(grasp.position)[:8].copy()
+    position[3, 0, 0] = np.nan
+    broken = jg.epsilon_quality(jg.Grasp(position, grasp.normal[:8], grasp[:8].model))
+    assert int(broken.status[3]) == Status.INVALID
+    assert np.isnan(np.asarray(broken.upper)[3])
+    assert np.isnan(np.asarray(broken.lower)[3])
+    others = [i for i in range(8) if i != 3]
+    np.testing.assert_array_equal(np.asarray(broken.upper)[others], np.asarray(eager.upper)[others])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("norm", ["L1", "Linf"])
+@pytest.mark.parametrize("name", ["soft", "frictionless", "mixed and padded"])
+def test_every_contact_model(norm, name):
+    rng = np.random.default_rng(6)
+    k = 9 if name == "frictionless" else 5
+    position, normal, friction = ball(rng, 60, k)
+    active = np.ones((60, k), bool)
+    if name == "soft":
+        model = jg.SoftFinger(friction, 0.2)
+    elif name == "frictionless":
+        normal = normal + rng.normal(size=normal.shape)
+        model = jg.Frictionless()
+    else:
+        friction[::2, 0] = 0.0
+        active[:, 4] = rng.random(60) < 0.5
+        model = jg.SoftFinger(friction, np.where(rng.random((60, k)) < 0.5, 0.1, 0.0))
+    grasp = jg.Grasp(position, normal, model, active)
+    q = jg.epsilon_quality(grasp, norm, certificate=True)
+    resistant = np.asarray(q.status) == Status.RESISTANT
+    assert resistant.sum() >= 5
+    assert jg.check_certificate(grasp, q).all()
+    assert np.mean(np.asarray(q.width)[resistant] <= 0.01) >= 0.99
+
+
+def test_mistakes_are_answered(grasp):
+    with pytest.raises(ValueError, match="norm must be one of L1, Linf"):
+        jg.epsilon_quality(grasp, "L2")
+    with pytest.raises(ValueError, match="tolerance must be between 0 and 1"):
+        jg.epsilon_quality(grasp, tolerance=0.0)
+    with pytest.raises(ValueError, match="torque_scale must be a length"):
+        jg.epsilon_quality(grasp, torque_scale=np.ones(3))
+    with pytest.raises(ValueError, match=r"takes a jaxgrasp\.Grasp"):
+        jg.epsilon_quality(np.ones(3))
