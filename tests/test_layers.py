@@ -96,6 +96,8 @@ FLOORS = [
     "surfaces.grid",
     "surfaces.mesh",
     "surfaces",
+    "requirements",
+    "placement",
     "candidates",
     "formats",
     "formats.parquet",
