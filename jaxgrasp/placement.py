@@ -137,7 +137,7 @@ def _climber(objective: Objective, optimizer: optax.GradientTransformation, requ
             slope = jnp.where(alive[:, None, None], slope, 0.0)
             with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
                 move, optimizer_state = optimizer.update(slope, state.optimizer, state.point)
-            moved = surface.project(state.point + move.astype(state.point.dtype))
+            moved = surface.project(state.point + move.astype(state.point.dtype))  # pyright: ignore
             moved = jnp.where(alive[:, None, None] & jnp.isfinite(moved), moved, state.point)
             best = jnp.where(better, scores, state.best)
             return _State(
