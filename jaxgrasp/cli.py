@@ -13,6 +13,7 @@ from rich.table import Table
 
 from .cli_check import CHECK_HELP, check
 from .cli_forces import FORCES_HELP, explain_forces, forces
+from .cli_place import PLACE_HELP, place
 from .errors import UserError
 from .terminal import ProgressBar, counts, numbers, quantiles, say, speed
 
@@ -172,6 +173,7 @@ def _print_summary(summary, run) -> None:
 
 app.command(help=FORCES_HELP)(forces)
 app.command(help=CHECK_HELP)(check)
+app.command(help=PLACE_HELP)(place)
 
 
 @app.command(help=EXPLAIN_HELP)

@@ -23,7 +23,7 @@ from .formats.saved_grasp import SavedGrasps
 from .run import MODELS
 from .status import Status
 
-__all__ = ["CRITERIA", "Load", "LoadRequest", "LoadRun", "closeness", "make_criterion", "prepare"]
+__all__ = ["CRITERIA", "Load", "LoadRequest", "LoadRun", "closeness", "make_criterion", "prepare", "writable"]
 
 # What the cost is, and its unit.
 CRITERIA = {
@@ -210,16 +210,17 @@ def _source(name: str) -> GraspFile | SavedGrasps:
     return GraspFile(path)
 
 
-def _writable(output: Path) -> None:
+def writable(output: Path, option: str = "-o") -> None:
+    """Whether a file can be put there: UserError naming the ``option`` that says another place."""
     if output.is_dir():
-        raise UserError(f"{output} is a directory; name a file with -o")
+        raise UserError(f"{output} is a directory; name a file with {option}")
     beside = output.with_name(f".{output.name}.{os.getpid()}.try")
     try:
         beside.touch()
         beside.unlink()
     except OSError as error:
         raise UserError(
-            f"{output} cannot be written: {error.strerror or error}; name another file with -o"
+            f"{output} cannot be written: {error.strerror or error}; name another file with {option}"
         ) from error
 
 
@@ -261,7 +262,7 @@ def prepare(request: LoadRequest) -> LoadRun:
     if output is not None:
         if output.resolve() == Path(request.source).resolve():
             raise UserError(f"{output} is the source; name another file with -o")
-        _writable(output)
+        writable(output)
     metadata = about | _metadata(request, source, kind, dimension, com, load, row)
     return LoadRun(
         source, rows, row, status, dimension, kind, com, load, criterion, request.max_normal, request.tolerance,

@@ -85,6 +85,10 @@ class ProgressBar:
         stage = "writing" if summary.done >= summary.candidates else "solving"
         self.progress.update(self.task, description=stage, completed=summary.done, told=told)
 
+    def stage(self, doing: str, done: int, told: str) -> None:
+        """What is being done, how much of it is, and a word about that."""
+        self.progress.update(self.task, description=doing, completed=done, told=told)
+
 
 def counts(summary: Summary, title: str, head: str) -> Table:
     """Grasps by status, and those a filter left out."""

@@ -113,17 +113,19 @@ FLOORS = [
     "loading",
     "force_report",
     "checking",
+    "placing",
     "",  # jaxgrasp/__init__.py, the table of contents
     "terminal",
     "cli_forces",
     "cli_check",
+    "cli_place",
     "cli",
     "__main__",
 ]
 SOLVER_KNOWS = {"_types", "cones"}
 HEAVY = ("mujoco", "trimesh", "pyarrow", "typer", "rich", "matplotlib")
 # The version is a constant of the table of contents; these read it when a command runs.
-READS_VERSION = {"cli", "run", "loads"}
+READS_VERSION = {"cli", "run", "loads", "placing"}
 
 
 def module_name(path: Path) -> str:

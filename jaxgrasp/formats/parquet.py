@@ -20,7 +20,8 @@ the dtype of the run; ``real[k][3]`` is fixed_size_list<fixed_size_list<real>[3]
                                     axes, unit norm; null where there is none
     iterations      int32           of the solver
 
-(The last two are lists of variable size because few readers take nulls among fixed-size ones.)
+(Forces and twists are lists of variable size: few readers take nulls among fixed-size ones. More columns may
+follow, which readers of grasps pass over: ``jaxgrasp place`` writes two, see ``placing``.)
 
 The file's metadata holds one key, ``jaxgrasp``, with JSON: ``schema_version``; ``object`` (name, sha256);
 ``unit``; ``centre_of_mass`` (m, mesh frame); ``model`` (kind, friction, torsion); ``fingers``; ``dtype``;
