@@ -97,8 +97,8 @@ def _lever(position: Array) -> Array:
     return jnp.concatenate([eye, moment], axis=1)
 
 
-def _resistant_slack(data: _Data, r: Array) -> Array:
-    """The least depth left at radius r; positive: still resistant."""
+def _resistant_slack(data: _Data, resistant: Array, r: Array) -> Array:
+    """The least depth left at radius r; positive: still resistant. Some finite number for grasps that never were."""
     A, active = data.A, data.active
     k, m, n = A.shape
     d = data.position.shape[-1]
@@ -108,7 +108,7 @@ def _resistant_slack(data: _Data, r: Array) -> Array:
     pull = jnp.sqrt(s[:, 0] ** 2 + (mu * _norm(s[:, 1 : min(n, d)])) ** 2)  # |F_i|
     spin = jnp.abs(gamma * s[:, 3]) if n == 4 else jnp.zeros_like(pull)
     wide = jnp.moveaxis(A, 0, 1).reshape(m, k * n)
-    gram = wide @ wide.T
+    gram = jnp.where(resistant, wide @ wide.T, jnp.eye(m, dtype=A.dtype))  # elsewhere it may be singular
     inverse = jnp.linalg.solve(gram, wide).T.reshape(k, n, m)  # A^+, contact by contact
     K = _lever(data.position)
     moved = r * pull + c * spin  # the torque a displaced, turned contact adds, besides its lever
@@ -153,7 +153,7 @@ def _escaping_slack(data: _Data, r: Array) -> Array:
 
 
 def _slack(data: _Data, resistant: Array, r: Array) -> Array:
-    return jnp.where(resistant, _resistant_slack(data, r), _escaping_slack(data, r))
+    return jnp.where(resistant, _resistant_slack(data, resistant, r), _escaping_slack(data, r))
 
 
 @jax.custom_jvp
