@@ -47,7 +47,7 @@ def place(
     ] = None,
     objective: Annotated[
         str,
-        typer.Option(help="What is maximised: margin, epsilon, epsilon-linf or guaranteed-radius."),
+        typer.Option(help="What is maximised: margin, epsilon or epsilon-linf."),
     ] = "margin",
     starts: Annotated[int, typer.Option(help="Random grasps to begin with.")] = 256,
     steps: Annotated[int, typer.Option(help="Gradient steps of each at most.")] = 150,

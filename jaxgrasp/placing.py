@@ -34,7 +34,6 @@ from .epsilon import epsilon_quality
 from .errors import UserError
 from .formats.parquet import Contacts, Verdicts, read_row, schema, table, write
 from .grasp import Grasp
-from .guaranteed_radius import guaranteed_radius
 from .loads import writable
 from .placement import FLOOR, Placement, PlacementProgress, margin, place_contacts
 from .report import Verdict, draw
@@ -59,7 +58,6 @@ OBJECTIVES: dict[str, Callable[[Grasp, float], Array]] = {
     "margin": lambda grasp, radius: margin(grasp),
     "epsilon": lambda grasp, radius: _epsilon(grasp, radius, "L1"),
     "epsilon-linf": lambda grasp, radius: _epsilon(grasp, radius, "Linf"),
-    "guaranteed-radius": lambda grasp, radius: guaranteed_radius(grasp).radius,
 }
 
 

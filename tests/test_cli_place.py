@@ -104,7 +104,6 @@ def test_the_same_seed_gives_the_same_bytes(placed, tmp_path):
     [
         "epsilon",
         "epsilon-linf",
-        pytest.param("guaranteed-radius", marks=pytest.mark.xfail(reason="its starts on a box do not move")),
     ],
 )
 def test_every_objective_grows(objective, tmp_path):
@@ -173,12 +172,14 @@ def test_help_has_examples(capsys):
     assert "jaxgrasp place mug" in said and "--edge-clearance" in said
 
 
+@pytest.mark.slow
 def test_a_grasp_that_does_not_hold_is_told_from_its_margin():
-    """Three fingers side by side: no grip, the margin. 120 degrees apart: the radius."""
+    """Three fingers side by side: no grip, the margin. 120 degrees apart: epsilon."""
     turn = np.array([[0.0, 0.1, 0.2], [0.0, 2.1, 4.2]])
     normal = -np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=-1)
     grasp = jg.Grasp(-0.05 * normal, normal, jg.HardFinger(jnp.asarray(0.5)))
-    value = np.asarray(placing.objective_of("guaranteed-radius", 0.05)(grasp))
+    value = np.asarray(placing.objective_of("epsilon", 0.05)(grasp))
     assert value[0] < -0.1
-    assert value[1] == pytest.approx(float(jg.guaranteed_radius(grasp[1]).radius), rel=1e-9)
+    quality = jg.epsilon_quality(grasp[1], torque_scale=0.05)
+    assert float(quality.lower) * 0.9 <= value[1] <= float(quality.upper) / 0.9
     assert value[1] > 0
