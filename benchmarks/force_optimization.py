@@ -16,11 +16,11 @@ turns; compile and construction times stand apart. No test asserts a time.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import time
 from pathlib import Path
 
+from figures import write_figures
 from wrench_resistance import hardware, random_grasps  # also pins the process and sets it to one thread
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -408,12 +408,7 @@ def main() -> None:
             rows = measure(k, criterion, options.problems, options.repeats, options.seed)
             results.setdefault(str(k), {})[criterion] = rows
             show(k, criterion, rows)
-    if options.json:
-        beside = options.json.with_suffix(".tmp")
-        settings = vars(options) | {"json": None}
-        beside.write_text(json.dumps({"hardware": machine, "options": settings, "k": results}, indent=1))
-        beside.replace(options.json)
-        print(f"\nwritten to {options.json}")
+    write_figures(options, machine, k=results)
 
 
 if __name__ == "__main__":

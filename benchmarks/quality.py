@@ -11,11 +11,11 @@ takes the hull of pyramids of ``--edges`` edges inside, and around, the friction
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from pathlib import Path
 
 # isort: split
+from figures import write_figures
 from wrench_resistance import hardware, random_grasps  # also pins the process and sets it to one thread
 
 # isort: split
@@ -134,12 +134,7 @@ def main() -> None:
             results.append({"contacts": k, "grasps": grasp.batch_shape[0], **row})
             figures = [f"{name} {value:.4g}" for name, value in row.items() if name != "measure"]
             print(f"  {row['measure']:24s} " + ", ".join(figures), flush=True)
-    if options.json:
-        beside = options.json.with_suffix(".tmp")
-        settings = vars(options) | {"json": None}
-        beside.write_text(json.dumps({"hardware": machine, "options": settings, "rows": results}, indent=1))
-        beside.replace(options.json)
-        print(f"\nwritten to {options.json}")
+    write_figures(options, machine, rows=results)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ Float64. Compile times stand apart; rates are medians over repeats. No test asse
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import platform
 import time
@@ -30,6 +29,7 @@ import equinox as eqx  # noqa: E402
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
+from figures import write_figures  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 
@@ -166,12 +166,7 @@ def main() -> None:
             if "commanded" in row:
                 line += f"  {row['commanded']:9.4%}  {row['largest_cone_use_less_1']:12.1e}"
             print(line, flush=True)
-    if options.json:
-        beside = options.json.with_suffix(".tmp")
-        settings = vars(options) | {"json": None}
-        beside.write_text(json.dumps({"hardware": machine, "options": settings, "rows": results}, indent=1))
-        beside.replace(options.json)
-        print(f"\nwritten to {options.json}")
+    write_figures(options, machine, rows=results)
 
 
 if __name__ == "__main__":

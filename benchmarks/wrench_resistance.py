@@ -12,7 +12,6 @@ take turns; compile and construction times stand apart. No test asserts a time.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import platform
 import time
@@ -30,6 +29,7 @@ from typing import Any  # noqa: E402
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
+from figures import write_figures  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 
@@ -274,12 +274,7 @@ def main() -> None:
     for k in options.contacts:
         results[k] = measure(k, options.grasps, options.repeats, options.seed)
         show(k, results[k])
-    if options.json:
-        beside = options.json.with_suffix(".tmp")
-        settings = vars(options) | {"json": None}
-        beside.write_text(json.dumps({"hardware": machine, "options": settings, "k": results}, indent=1))
-        beside.replace(options.json)
-        print(f"\nwritten to {options.json}")
+    write_figures(options, machine, k=results)
 
 
 if __name__ == "__main__":

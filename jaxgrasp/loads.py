@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import os
-import platform
-import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from .contacts import Component, ContactModel
@@ -20,7 +17,7 @@ from .errors import UserError
 from .formats.force_table import GraspFile
 from .formats.parquet import Contacts
 from .formats.saved_grasp import SavedGrasps
-from .run import MODELS
+from .run import MODELS, provenance
 from .status import Status
 
 __all__ = ["CRITERIA", "Load", "LoadRequest", "LoadRun", "closeness", "make_criterion", "prepare", "writable"]
@@ -273,8 +270,6 @@ def prepare(request: LoadRequest) -> LoadRun:
 def _metadata(
     request: LoadRequest, source, kind: str, dimension: int, com, load: Load, row
 ) -> dict[str, Any]:
-    from . import __version__
-
     words = ["jaxgrasp", "forces", request.source]
     options: list[tuple[str, Any]] = [
         ("--row", request.row), ("--status", request.status), ("--mass", request.mass),
@@ -310,12 +305,5 @@ def _metadata(
         },
         "max_normal": request.max_normal,
         "tolerance": request.tolerance,
-        "command": shlex.join(words),
-        "backend": jax.default_backend(),
-        "versions": {
-            "jaxgrasp": __version__,
-            "jax": jax.__version__,
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
+        **provenance(words),
     }

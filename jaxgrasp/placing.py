@@ -14,15 +14,12 @@ from __future__ import annotations
 
 import functools
 import importlib.util
-import platform
-import shlex
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
@@ -38,7 +35,7 @@ from .loads import writable
 from .placement import FLOOR, Placement, PlacementProgress, margin, place_contacts
 from .report import Verdict, draw
 from .requirements import Apart, EdgeClearance, JawWidth, Requirement
-from .run import MODELS, coefficients
+from .run import MODELS, coefficients, provenance
 from .status import Status
 from .surfaces import MeshSurface
 
@@ -187,8 +184,6 @@ def _drawable(picture: Path, output: Path) -> None:
 
 
 def _metadata(request: PlaceRequest, body: meshes.Body, friction: float, torsion: float) -> dict[str, Any]:
-    from . import __version__
-
     asked = {name: getattr(request, name) for name in ("apart", "edge_clearance", "jaw_width")}
     options: dict[str, Any] = {
         "unit": body.unit,
@@ -214,14 +209,7 @@ def _metadata(request: PlaceRequest, body: meshes.Body, friction: float, torsion
         "model": {"kind": request.model, "friction": friction, "torsion": torsion},
         "dtype": "float64",
         "tolerance": 1e-8,
-        "command": shlex.join(words),
-        "backend": jax.default_backend(),
-        "versions": {
-            "jaxgrasp": __version__,
-            "jax": jax.__version__,
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
+        **provenance(words),
     }
 
 

@@ -19,7 +19,7 @@ from .contacts import ContactModel, Frictionless, HardFinger, SoftFinger
 from .errors import UserError
 from .formats.parquet import ContactFile, Contacts
 
-__all__ = ["MODELS", "Request", "Run", "coefficients", "prepare"]
+__all__ = ["MODELS", "Request", "Run", "coefficients", "prepare", "provenance"]
 
 MODELS = {"hard": HardFinger, "soft": SoftFinger, "frictionless": Frictionless}
 SAMPLERS = ("auto", "surface", "antipodal")
@@ -123,6 +123,22 @@ def coefficients(kind: str, friction: float | None, torsion: float | None) -> tu
     mu = 0.0 if kind == "frictionless" else 0.5 if friction is None else float(friction)
     gamma = 0.0 if kind != "soft" else 0.01 if torsion is None else float(torsion)
     return mu, gamma
+
+
+def provenance(words: list[str]) -> dict[str, Any]:
+    """What a file says about its making: the command, the backend, the versions."""
+    from . import __version__
+
+    return {
+        "command": shlex.join(words),
+        "backend": jax.default_backend(),
+        "versions": {
+            "jaxgrasp": __version__,
+            "jax": jax.__version__,
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+        },
+    }
 
 
 def prepare(request: Request) -> Run:
@@ -234,8 +250,6 @@ def _from_contacts(request: Request) -> Run:
 def _run(
     request: Request, source, samples, fingers, model, com, unit, about, warnings, override=frozenset()
 ) -> Run:
-    from . import __version__
-
     kind, friction, torsion = model
     words = ["jaxgrasp", "screen", request.source, "--model", kind]
     sampled = not isinstance(source, ContactFile)
@@ -266,14 +280,7 @@ def _run(
         "tolerance": request.tolerance,
         "verdict_only": request.verdict_only,
         "filter": request.filter,
-        "command": shlex.join(words),
-        "backend": jax.default_backend(),
-        "versions": {
-            "jaxgrasp": __version__,
-            "jax": jax.__version__,
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
+        **provenance(words),
     }
     name = Path(request.source).name.removesuffix(".gz")
     stem = name if request.source in objects.OBJECTS else Path(name).stem

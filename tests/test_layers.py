@@ -125,7 +125,7 @@ FLOORS = [
 SOLVER_KNOWS = {"_types", "cones"}
 HEAVY = ("mujoco", "trimesh", "pyarrow", "typer", "rich", "matplotlib")
 # The version is a constant of the table of contents; these read it when a command runs.
-READS_VERSION = {"cli", "run", "loads", "placing"}
+READS_VERSION = {"cli", "run"}
 
 
 def module_name(path: Path) -> str:

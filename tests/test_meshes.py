@@ -1,11 +1,10 @@
 import gzip
 import hashlib
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from real_data import real_meshes
 
 from jaxgrasp import meshes, objects
 from jaxgrasp.errors import UserError
@@ -179,17 +178,9 @@ def test_degenerate_faces_do_not_matter(tmp_path):
     assert body.mesh.area == pytest.approx(2 * (0.12 * 0.08 + 0.12 * 0.06 + 0.08 * 0.06))
 
 
-def data_folder() -> Path:
-    told = os.environ.get("JAXGRASP_DATA")
-    folder = Path(told) if told else Path(__file__).parents[2] / "shared" / "data"
-    if not (folder / "meshes").is_dir():
-        pytest.skip("no real meshes: set JAXGRASP_DATA to a folder that holds meshes/")
-    return folder / "meshes"
-
-
 @pytest.mark.realdata
 def test_every_real_mesh_loads_or_says_why_not():
-    files = [f for f in sorted(data_folder().glob("*/*")) if f.is_file() and f.suffix not in (".md", ".txt")]
+    files = [f for f in sorted(real_meshes().glob("*/*")) if f.is_file() and f.suffix not in (".md", ".txt")]
     watertight = 0
     for file in files:
         body = meshes.load(file)

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -14,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from real_data import real_meshes
 
 import jaxgrasp as jg
 from jaxgrasp import meshes, screening, shards
@@ -354,12 +354,8 @@ def test_quantiles_of_a_histogram():
 
 @pytest.mark.realdata
 def test_every_watertight_real_mesh_screens_to_the_end(tmp_path, dtype):
-    told = os.environ.get("JAXGRASP_DATA")
-    folder = (Path(told) if told else Path(__file__).parents[2] / "shared" / "data") / "meshes"
-    if not folder.is_dir():
-        pytest.skip("no real meshes: set JAXGRASP_DATA to a folder that holds meshes/")
     screened = 0
-    for file in sorted(folder.glob("*/*")):
+    for file in sorted(real_meshes().glob("*/*")):
         if not file.is_file() or file.suffix in (".md", ".txt") or not meshes.load(file).watertight:
             continue
         summary = screen(prepare(request(tmp_path, dtype, source=str(file), samples=256)))

@@ -1,13 +1,11 @@
 """Surfaces: nearest points, normals, curvature, edges, samples, of shapes and of meshes."""
 
-import os
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from real_data import real_meshes
 from scipy.spatial import KDTree
 
 from jaxgrasp import meshes, objects, surfaces
@@ -582,14 +580,6 @@ def test_surfaces_of_names_files_and_bodies(tmp_path):
 # Real meshes -------------------------------------------------------------------------------------------------------
 
 
-def data_folder() -> Path:
-    told = os.environ.get("JAXGRASP_DATA")
-    folder = Path(told) if told else Path(__file__).parents[2] / "shared" / "data"
-    if not (folder / "meshes").is_dir():
-        pytest.skip("no real meshes: set JAXGRASP_DATA to a folder that holds meshes/")
-    return folder / "meshes"
-
-
 @pytest.mark.slow
 @pytest.mark.realdata
 @pytest.mark.parametrize(
@@ -602,7 +592,7 @@ def data_folder() -> Path:
     ],
 )
 def test_real_meshes(file, unit):
-    surface = surfaces.of(data_folder() / file, unit)
+    surface = surfaces.of(real_meshes() / file, unit)
     cell, size = float(surface.grid.spacing), float(surface.radius)
     point, _ = surface.sample(0, 5000)
     point = point + np.random.default_rng(0).normal(0, 0.3 * cell, point.shape)
