@@ -59,19 +59,8 @@ def friction_sweep(grasp: Grasp, factors: Float[Array, " T"], verdict_only: bool
     if array.ndim != 1:
         raise ValueError(f"factors must be a list of numbers, shape (T,), got {array.shape}")
 
-    def spread(x: Array) -> Array:
-        b = len(grasp.batch_shape)
-        wide = jnp.expand_dims(x, b)
-        return jnp.broadcast_to(wide, (*grasp.batch_shape, array.shape[0], *x.shape[b:]))
-
-    wide = Grasp(
-        spread(grasp.position),
-        spread(grasp.normal),
-        grasp.model.with_coefficients(
-            spread(grasp.model.friction_coefficient), spread(grasp.model.torsion_coefficient)
-        ),
-        spread(grasp.active),
-    )
+    axis = len(grasp.batch_shape)
+    wide = jax.tree.map(lambda x: jnp.repeat(jnp.expand_dims(x, axis), array.shape[0], axis), grasp)
     return wrench_resistance(with_friction_factor(wide, array), verdict_only=verdict_only)
 
 
@@ -129,12 +118,15 @@ def _advance(bracket: _Bracket, at: Array, value: Array, width: float) -> _Brack
 
 
 def _search(grasp: Grasp, loop: Callable[..., Any]) -> tuple[Array, Array]:
-    """log alpha at both ends; (-inf, log LEAST) where any friction will do, (log MOST, inf) where none does."""
+    """log alpha at both ends; (-inf, log LEAST) where any friction will do, (log MOST, inf) where none does.
+
+    NaN where INVALID.
+    """
     shape, dtype = grasp.batch_shape, grasp.dtype
     width = _width(dtype)
     low, high = jnp.full(shape, jnp.log(LEAST), dtype), jnp.full(shape, jnp.log(MOST), dtype)
     below, above = _margin(grasp, low), _margin(grasp, high)
-    always, never = below > 0, ~(above > 0)
+    invalid, always, never = jnp.isnan(above), below > 0, ~(above > 0)
     at_low = jnp.where(always | never, high, low)  # closed at once
     zero = jnp.zeros(shape, jnp.int32)
     start = _Bracket(at_low, high, jnp.where(always, -1.0, below), jnp.where(never, 1.0, above), zero, zero)
@@ -147,8 +139,10 @@ def _search(grasp: Grasp, loop: Callable[..., Any]) -> tuple[Array, Array]:
         return _advance(bracket, at, _margin(grasp, at), width)
 
     end = loop(unfinished, step, start)
+    nan = jnp.where(invalid, jnp.nan, jnp.zeros_like(above))
     lower = jnp.where(always, -jnp.inf, jnp.where(never, jnp.log(MOST), end.low))
-    return lower, jnp.where(always, jnp.log(LEAST), jnp.where(never, jnp.inf, end.high))
+    upper = jnp.where(always, jnp.log(LEAST), jnp.where(never, jnp.inf, end.high))
+    return lower + nan, upper + nan
 
 
 def _python_loop(unfinished, step, state):
@@ -217,6 +211,4 @@ def critical_friction(grasp: Grasp) -> CriticalFriction:
         raise ValueError(f"critical_friction takes a jaxgrasp.Grasp, got {type(grasp).__name__}")
     still = jax.tree.map(lax.stop_gradient, grasp)
     factor, lower, upper = _critical(_data(grasp), still.model, grasp.active)
-    status = wrench_resistance(still, verdict_only=True).status
-    nan = jnp.where(status == Status.INVALID.value, jnp.nan, jnp.zeros_like(factor))
-    return CriticalFriction(factor + nan, lower + nan, upper + nan)
+    return CriticalFriction(factor, lower, upper)

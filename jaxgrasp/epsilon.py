@@ -128,7 +128,7 @@ def _search(A: Array, active: Array, internal: Array, norm: str, tolerance: Arra
     """One resistant grasp."""
     outermost = functools.partial(support, A, active, norm)
     axes, forces = _seed(A, internal, active, norm)
-    polytope = begin(axes, forces, CAPACITIES[0])
+    polytope = begin(axes, forces)
     for capacity in CAPACITIES:
         polytope = grow(widen(polytope, capacity), outermost, tolerance, capacity)
     lower, upper, direction = polytope.lower, polytope.upper, polytope.direction

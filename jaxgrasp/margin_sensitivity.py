@@ -34,7 +34,6 @@ from .verdict import Verdict, unfold
 
 __all__ = ["Solved", "differentiable"]
 
-CENTRINGS = 1  # Newton steps onto the central path before the solution is differentiated
 NO_BOUNDS = Bounds(None, None, None, None, None)
 
 
@@ -125,9 +124,8 @@ def _tangents(form: _Form, result: Solved, contacts: Contacts, change: Any) -> S
     scales = jax.tree.map(lambda x: lax.stop_gradient(to_lanes(kept(ok, flat(x), 1.0))), result.scales)
     program = _program(form, data, scales)
     fixed = lax.stop_gradient((data, scales))
-    for _ in range(CENTRINGS):
-        near = tiled_solver(partial(_program, form), *fixed, lax.stop_gradient(point), form.width)
-        point = centred(lax.stop_gradient(program), point, near)
+    near = tiled_solver(partial(_program, form), *fixed, lax.stop_gradient(point), form.width)
+    point = centred(lax.stop_gradient(program), point, near)
     _, residual = jax.jvp(lambda c: residuals(_program(form, c, scales), point), (data,), (changes,))
     solver = tiled_solver(partial(_program, form), *fixed, lax.stop_gradient(point), form.width)
     moved = point_tangent(program, point, residual, solver)

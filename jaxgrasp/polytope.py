@@ -87,23 +87,19 @@ def _cross_polytope(m: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return 1 - 2 * negative, corners.astype(np.int32), across.astype(np.int32)
 
 
-def begin(axes: Array, labels: Array, capacity: Capacity) -> Polytope:
-    """The cross-polytope with vertices ``+-axes[j]``, (m, m) mutually orthogonal, labelled (2 m, ..): +, -, +, ..."""
+def begin(axes: Array, labels: Array) -> Polytope:
+    """The cross-polytope with vertices ``+-axes[j]``, (m, m) orthogonal, labelled (2 m, ..): +, -, ..."""
     m, dtype = axes.shape[0], axes.dtype
     signs, corners, across = _cross_polytope(m)
     square = jnp.sum(axes * axes, axis=-1, keepdims=True)
     polar = jnp.einsum("fj,jm->fm", jnp.asarray(signs, dtype), axes / square)
     points = jnp.stack([axes, -axes], axis=1).reshape(2 * m, m)
-
-    def padded(array, length):
-        return jnp.zeros((length, *array.shape[1:]), array.dtype).at[: array.shape[0]].set(array)
-
     return Polytope(
-        padded(labels, capacity.vertices),
-        padded(points, capacity.vertices),
-        padded(jnp.asarray(corners), capacity.facets),
-        padded(jnp.asarray(across), capacity.facets),
-        padded(polar, capacity.facets),
+        labels,
+        points,
+        jnp.asarray(corners),
+        jnp.asarray(across),
+        polar,
         jnp.int32(2 * m),
         jnp.int32(2**m),
         jnp.asarray(jnp.inf, dtype),
