@@ -1,11 +1,12 @@
 """Quality measures on one core: the certified epsilon bracket beside Qhull's pyramids, and what each measure costs.
 
-    python benchmarks/quality.py [--json FILE] [--grasps 500] [--contacts 3 4 5 8] [--edges 32] [--hulls 20]
+    python benchmarks/quality.py [--json FILE] [--grasps 500] [--contacts 3 4 5 8] [--edges 32] [--hulls N]
 
 One process pinned to one core, single-threaded. Hard fingers on a sphere with tilted normals, mu in [0.3, 0.8]; those
 that are wrench resistant count. The width is (upper - lower) / upper; every bracket is proved by the checker. Qhull
 takes the hull of pyramids of ``--edges`` edges inside, and around, the friction cones of the first ``--hulls`` grasps
-(L1): bounds of its own, which the bracket must overlap. Times are medians of three; compile times stand apart.
+(L1; by default all of them up to four contacts, fifty beyond, where a hull takes up to a second): bounds of its
+own, which the bracket must overlap. Times are medians of three; compile times stand apart.
 """
 
 from __future__ import annotations
@@ -78,7 +79,9 @@ def brackets(grasp: jg.Grasp, norm: str) -> dict[str, Any]:
     }
 
 
-def qhull(grasp: jg.Grasp, edges: int, hulls: int) -> dict[str, Any]:
+def qhull(grasp: jg.Grasp, edges: int, hulls: int | None) -> dict[str, Any]:
+    if hulls is None:
+        hulls = grasp.batch_shape[0] if grasp.contacts <= 4 else 50
     A = np.asarray(effort_map(grasp, torque_lengths(grasp)))[:hulls]
     q = jg.epsilon_quality(grasp[:hulls])
     lower, upper = np.asarray(q.lower), np.asarray(q.upper)
@@ -88,6 +91,7 @@ def qhull(grasp: jg.Grasp, edges: int, hulls: int) -> dict[str, Any]:
     outer = np.array([pyramid(a, edges, True) for a in A])
     return {
         "measure": f"Qhull, {edges} edges inside",
+        "hulls": len(A),
         "milliseconds": 1e3 * seconds / len(A),
         "median_width": float(np.median(1 - inner / outer)),
         "contradictions": int(np.sum((inner > upper * (1 + 1e-9)) | (lower > outer * (1 + 1e-9)))),
@@ -119,7 +123,7 @@ def main() -> None:
     parser.add_argument("--grasps", type=int, default=500)
     parser.add_argument("--contacts", type=int, nargs="+", default=[3, 4, 5, 8])
     parser.add_argument("--edges", type=int, default=32)
-    parser.add_argument("--hulls", type=int, default=20)
+    parser.add_argument("--hulls", type=int)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     machine = hardware()

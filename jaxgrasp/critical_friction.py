@@ -28,6 +28,7 @@ __all__ = ["CriticalFriction", "critical_friction", "friction_sweep", "with_fric
 
 LEAST, MOST = 1e-6, 1e6  # factors searched: less counts as 0, more as infinity
 HALVED, ROUNDS = 6, 70
+SLOPE_TOLERANCE = 1e-12  # of the margin whose derivatives make the factor's: they are good to about its root
 
 
 class CriticalFriction(eqx.Module):
@@ -188,7 +189,8 @@ def _critical_jvp(primals, tangents):
     at = jnp.where(inside, factor, 1.0)
 
     def margin(data: _Data, factor: Array) -> Array:
-        return wrench_resistance(with_friction_factor(_grasp(data, model, active), factor)).margin
+        moved = with_friction_factor(_grasp(data, model, active), factor)
+        return wrench_resistance(moved, tolerance=SLOPE_TOLERANCE).margin
 
     _, by_data = jax.jvp(lambda d: margin(d, at), (data,), (tangents[0],))
     _, by_factor = jax.jvp(lambda a: margin(data, a), (at,), (jnp.ones_like(at),))

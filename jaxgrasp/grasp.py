@@ -184,8 +184,9 @@ def folded_grasp_map(grasp: Grasp) -> Float[Array, "*batch m kn"]:
 def length_scale(grasp: Grasp) -> Float[Array, "*batch"]:
     """``L = max_i |p_i|`` over the active contacts in m, or 1 where that is zero."""
     squares = jnp.sum(grasp.position**2, axis=-1)
-    largest = jnp.sqrt(jnp.max(jnp.where(grasp.active, squares, 0.0), axis=-1))
-    return jnp.where(largest > 0, largest, jnp.ones_like(largest))
+    largest = jnp.max(jnp.where(grasp.active, squares, 0.0), axis=-1)
+    there = largest > 0
+    return jnp.where(there, jnp.sqrt(jnp.where(there, largest, 1.0)), 1.0)
 
 
 def _per_length(grasp: Grasp, matrix: Array) -> Array:

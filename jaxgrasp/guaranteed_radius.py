@@ -38,6 +38,7 @@ __all__ = ["GuaranteedRadius", "guaranteed_radius"]
 
 HALVINGS = 60
 LARGEST = 0.5  # beyond it the chord bound is of no use
+TOLERANCE = 1e-12  # of the margin; forces and twists, and the derivative with them, are known to its root
 
 
 class GuaranteedRadius(eqx.Module):
@@ -187,19 +188,19 @@ def guaranteed_radius(grasp: Grasp) -> GuaranteedRadius:
     grasp  a ``Grasp`` with any batch axes; works under ``jax.jit`` and ``jax.vmap``
 
     A guarantee, not an estimate: the nearest change of verdict that we could find lies a few times further out (a
-    median of 3 to 6 times on random grasps). Differentiable with respect to positions, normals, mu and gamma, with L
-    held fixed; where NOT_RESISTANT the escape twist is held fixed as well, which is a guarantee of its own.
+    median of 3 to 6 times on random grasps). Differentiable with respect to positions, normals, mu and gamma; kinks lie
+    where another contact becomes the first to slip.
     """
     if not isinstance(grasp, Grasp):
         raise ValueError(f"guaranteed_radius takes a jaxgrasp.Grasp, got {type(grasp).__name__}")
-    verdict = wrench_resistance(grasp)
+    verdict = wrench_resistance(grasp, tolerance=TOLERANCE)
     return _guarantee(grasp, verdict.status, verdict.internal_force, verdict.escape_twist, verdict.margin)
 
 
 @jax.jit
 def _guarantee(grasp: Grasp, status: Array, force: Array, twist: Array, margin: Array) -> GuaranteedRadius:
     d, batch = grasp.dimension, grasp.batch_shape
-    length = lax.stop_gradient(length_scale(grasp))
+    length = length_scale(grasp)
     valid = status != Status.INVALID.value
     resistant = status == Status.RESISTANT.value
     escaping = (status == Status.NOT_RESISTANT.value) & jnp.isfinite(margin)
@@ -212,7 +213,7 @@ def _guarantee(grasp: Grasp, status: Array, force: Array, twist: Array, margin: 
     normal = safe(normalize(grasp.normal), 0.0)
     s = scaled(grasp, safe(force.reshape(*batch, grasp.contacts, -1), 0.0).reshape(force.shape))
     scaled_twist = jnp.concatenate([twist[..., :d], twist[..., d:] * length[..., None]], axis=-1)
-    size = jnp.sqrt(jnp.sum(scaled_twist**2, axis=-1, keepdims=True))
+    size = _norm(scaled_twist)[..., None]
     scaled_twist = scaled_twist / jnp.where(size > 0, size, 1.0)
     A = safe(effort_map(grasp, length), 0.0)
     identity = jnp.eye(A.shape[-2], A.shape[-1], dtype=A.dtype)

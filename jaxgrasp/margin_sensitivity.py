@@ -2,9 +2,10 @@
 
     d t* = derivative of the Lagrangian of the margin's cone program, the solution fixed    (envelope theorem)
 
-and of the internal force behind it, by the implicit function theorem. t* depends on Null(A) alone, so the length L,
-which scales the program, is held fixed; the factor of A serves the linear solve alone. A ``custom_jvp`` whose rule
-calls the same function: it nests. Lanes without a margin (INVALID, t* = -inf), and all lanes of ``verdict_only``, have
+and of the internal force and the escape twist behind it, by the implicit function theorem. t* depends on Null(A)
+alone, so the length L, which scales the program, is held fixed; the factor of A serves the linear solve alone. An
+escape twist read from the rank of A, or from unit forces alone, stays where it is. A ``custom_jvp`` whose rule calls
+the same function: it nests. Lanes without a margin (INVALID, t* = -inf), and all lanes of ``verdict_only``, have
 derivative 0.
 """
 
@@ -36,6 +37,7 @@ from .verdict import Verdict, unfold
 __all__ = ["Solved", "differentiable"]
 
 NO_BOUNDS = Bounds(None, None, None, None, None)
+TWIST_READ = 1e-3  # an escape twist this near the multipliers' own was read from them
 
 
 class Solved(NamedTuple):
@@ -87,6 +89,14 @@ def _internal_force(
     """``s = u + t e`` in the caller's components."""
     s = (exists * (u[0] + t), *(exists * x for x in u[1:]))
     return unfold(s, components, to_lanes(contacts.friction), to_lanes(contacts.torsion))
+
+
+def _twist(y: Array, length: Array) -> Array:
+    """(m, N) unit (velocity; angular velocity) of the multipliers y of A, whose lengths are over ``length``."""
+    m = y.shape[0]
+    physical = y / jnp.where(jnp.arange(m)[:, None] < (2 if m == 3 else 3), 1.0, length)
+    square = jnp.sum(physical * physical, axis=0)
+    return physical / jnp.sqrt(jnp.where(square > 0, square, 1.0))
 
 
 def differentiable(
@@ -147,11 +157,16 @@ def _tangents(form: _Form, result: Solved, contacts: Contacts, change: Any) -> S
         (changes, moved.u, -cost),
     )
 
+    y_read = -to_lanes(kept(ok, y, 0.0))
+    twist = kept(ok, flat(result.verdict.escape_twist), 0.0)
+    read = jnp.all(jnp.abs(_twist(y_read, scales.length) - to_lanes(twist)) < TWIST_READ, axis=0)
+    _, turned = jax.jvp(lambda y: _twist(y, scales.length), (point.y,), (jnp.where(read, moved.y, 0.0),))
+
     def back(x: Array) -> Array:
         x = jnp.where(ok, x, jnp.zeros_like(x))
         return to_rows(x).reshape(*batch, *x.shape[:-1])
 
     zero = jax.tree.map(zero_tangent, result)
-    verdict = zero.verdict._replace(margin=back(-cost), internal_force=back(force))
+    verdict = zero.verdict._replace(margin=back(-cost), internal_force=back(force), escape_twist=back(turned))
     moves = (back(-moved.y), back(jnp.stack(moved.u)), back(jnp.stack(moved.z)))
     return zero._replace(verdict=verdict, point=moves)

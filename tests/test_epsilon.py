@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 
 import jaxgrasp as jg
@@ -145,6 +146,59 @@ def test_linf_ball_is_resisted_and_no_larger_one():
     out = jg.task_quality(grasp[resistant], loads, "Linf")
     assert (np.asarray(out.effort) <= 1 + 1e-6).all()
     assert (np.asarray(out.effort)[:, 0] >= 0.98).all()  # the worst wrench takes it all
+
+
+def resisted_multiple(wide, limits, equal, w):
+    """The largest t with t w a wrench of forces x >= 0 (columns of ``wide``), ``limits x <= equal`` the effort."""
+    count = wide.shape[1]
+    out = linprog(
+        np.append(np.zeros(count), -1.0),
+        A_ub=np.hstack([limits, np.zeros((len(limits), 1))]),
+        b_ub=equal,
+        A_eq=np.hstack([wide, -w[:, None]]),
+        b_eq=np.zeros(len(w)),
+    )
+    assert out.status == 0
+    return -out.fun
+
+
+@pytest.mark.slow
+def test_spatial_linf_against_support_directions_and_linear_programs():
+    """No one of 10^5 directions is weaker than ``upper``, and linear programs agree with both bounds.
+
+    cone(c mu) < pyramid of 32 edges inside cone(mu) < cone(mu) < pyramid around it, with c = cos(pi / 32): what the
+    cones resist is bounded by the pyramids on either side, in random directions and along the weakest one.
+    """
+    rng = np.random.default_rng(3)
+    position, normal, friction = ball(rng, 24, 4)
+    edges, c = 32, np.cos(np.pi / 32)
+    q, less = (
+        jg.epsilon_quality(jg.Grasp(position, normal, jg.HardFinger(share * friction)), "Linf")
+        for share in (1.0, c)
+    )
+    grasp = jg.Grasp(position, normal, jg.HardFinger(friction))
+    resistant = np.flatnonzero(np.asarray(q.status) == Status.RESISTANT)
+    assert len(resistant) >= 10
+    A = np.asarray(effort_map(grasp, torque_lengths(grasp)))
+    direction = rng.normal(size=(100_000, 6))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    angle = 2 * np.pi * np.arange(edges) / edges
+    effort = np.repeat(np.eye(4), edges, axis=1)  # the normal force of each contact
+    for i in resistant:
+        lower, upper, worst = float(q.lower[i]), float(q.upper[i]), np.asarray(q.direction[i])
+        v = np.einsum("kmn,dm->dkn", A[i], direction)
+        support = np.maximum(v[..., 0] + np.linalg.norm(v[..., 1:], axis=-1), 0).sum(-1).min()
+        assert lower <= upper * (1 + 1e-9) <= support * (1 + 2e-9)
+        rim = np.cos(angle)[:, None] * A[i][:, None, :, 1] + np.sin(angle)[:, None] * A[i][:, None, :, 2]
+        inner = (A[i][:, None, :, 0] + rim).reshape(-1, 6).T
+        outer = (A[i][:, None, :, 0] + rim / c).reshape(-1, 6).T
+        for w in (worst, *direction[:20]):
+            assert resisted_multiple(inner, effort, np.ones(4), w) >= float(less.lower[i]) * (1 - 1e-7)
+            assert resisted_multiple(outer, effort, np.ones(4), w) >= lower * (1 - 1e-7)
+        v = np.einsum("kmn,m->kn", A[i], worst)
+        assert resisted_multiple(inner, effort, np.ones(4), worst) <= upper * (1 + 1e-7)
+        around = np.maximum(v[:, 0] + np.linalg.norm(v[:, 1:], axis=-1) / c, 0).sum()
+        assert resisted_multiple(outer, effort, np.ones(4), worst) <= around * (1 + 1e-7) <= 1.03 * upper
 
 
 def test_nothing_depends_on_axes_order_or_units(grasp, answer):
