@@ -55,19 +55,17 @@ class Placement:
 
     grasp     the grasps found, best first (n of them), positions about the surface's centre in m
     position  (n, k, 3) the same contacts in the surface's own frame
-    origin    (n, k, 3) where each of them began
     value     (n,) the objective there          start   (n,) which start each comes from
     verdict   their ``WrenchResistance``         proved  (n,) bool: the independent checker accepted it
     before, after   (starts,) margins of every start and of where it ended
     resistant (starts,) bool: ended wrench resistant, with a certificate the checker accepts
-    end       (starts, k, 3) m: where every start ended, in the surface's own frame
+    origin, end (starts, k, 3) m: where every start began and ended, in the surface's own frame
     steps     (starts,) steps taken; a start with a NaN objective ends at its last good point
     excess    (starts,) m: how far the requirements are from being met; only grasps within them are in ``grasp``
     """
 
     grasp: Grasp
     position: np.ndarray
-    origin: np.ndarray
     value: np.ndarray
     start: np.ndarray
     verdict: WrenchResistance
@@ -75,6 +73,7 @@ class Placement:
     before: np.ndarray
     after: np.ndarray
     resistant: np.ndarray
+    origin: np.ndarray
     end: np.ndarray
     steps: np.ndarray
     excess: np.ndarray
@@ -304,6 +303,6 @@ def _judged(
     verdict = wrench_resistance(grasp)
     steps = np.sum([end.steps for end in ends], axis=0)
     return Placement(
-        grasp, exact.position[chosen], origin[chosen], final, chosen, verdict, check_certificate(grasp, verdict),
-        before, exact.margin, exact.resistant, exact.position, steps, exact.excess,
+        grasp, exact.position[chosen], final, chosen, verdict, check_certificate(grasp, verdict),
+        before, exact.margin, exact.resistant, origin, exact.position, steps, exact.excess,
     )  # fmt: skip
