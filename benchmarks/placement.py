@@ -4,8 +4,8 @@
                                    [--fingers 3 4 2] [--no-table]
 
 Costs: starts and steps per second on the mug; value, gradient and quality measures per grasp; the epsilon bracket
-beside Qhull's hull of 32-edge pyramids. Table: every object, three and four hard fingers (mu 0.5) and two soft ones (gamma 1
-cm), the objective epsilon (L1, torques over the object's radius). Beside ``place_contacts``, per start:
+beside Qhull's hull of 32-edge pyramids. Table: every object, three and four hard fingers (mu 0.5), two soft ones
+(gamma 1 cm), the objective epsilon (L1, torques over the object's radius). Beside ``place_contacts``, per start:
 
     random m   the random grasp of largest margin among as many as fit in the same time
     random e   half that time for margins, half for epsilon of those with the largest margins: the largest epsilon

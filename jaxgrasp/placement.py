@@ -224,8 +224,8 @@ def place_contacts(
     progress      called with a ``PlacementProgress`` as starts end
 
     UserError where no contact can meet the requirements; ValueError for wrong arguments. NaN in the objective ends
-    its own start alone. A start whose last climb ended in a grasp that does not hold on the exact surface keeps the
-    grasp of the guide's climb.
+    its own start alone. A start whose climb ended in a grasp that does not hold on the exact surface keeps the grasp of
+    the guide's climb or, failing that, the one it began with.
     """
     if not isinstance(surface, Surface):
         raise ValueError(
@@ -282,15 +282,15 @@ def _judged(
     """Exact contacts, verdicts and proofs of all starts; the best distinct ones among those within the requirements."""
     limit = SLACK * float(task.surface.radius)
     exact, value = _exact(task, ends[-1].point), ends[-1].value
-    if len(ends) > 1:
-        earlier = _exact(task, ends[0].point)
-        lost = earlier.resistant & (earlier.excess <= limit) & ~(exact.resistant & (exact.excess <= limit))
-        exact = _Exact(
-            *(
-                np.where(lost.reshape(-1, *[1] * (a.ndim - 1)), a, b)
-                for a, b in zip(earlier, exact, strict=True)
-            )
-        )
+    # The exact surface is not quite the smooth one: what was lost there goes back to the guide's end, or to the start.
+    for earlier in (*(end.point for end in ends[-2::-1]), origin):
+        lost = ~(exact.resistant & (exact.excess <= limit))
+        if not lost.any():
+            break
+        before_it = _exact(task, earlier)
+        lost = lost & before_it.resistant & (before_it.excess <= limit)
+        pairs = zip(before_it, exact, strict=True)
+        exact = _Exact(*(np.where(lost.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs))
         value = np.where(lost, -np.inf, value)
     order = np.flatnonzero(np.isfinite(ends[-1].value) & (exact.excess <= limit))
     order = order[np.lexsort((-value[order], ~exact.resistant[order]))]
