@@ -157,7 +157,7 @@ def test_any_measure_climbs(measure, gains):
         grasp = jg.Grasp(out.end, surface.normal(out.end), jg.HardFinger(0.5))
         return np.median(np.asarray(measure(grasp)))
 
-    # Where the margin is largest the internal force has a kink, and so has the radius: it ends no lower, often no higher.
+    # Where the margin is largest the internal force has a kink, and so has the radius: it ends no lower.
     if gains:
         assert median(climbed) > median(margin)
     else:
