@@ -134,4 +134,9 @@ def _newton(A: Array, norm: str, near: Touch, upper: Array, core_below: Array, e
     fine = stationary_tolerance(dtype)
     sound = jnp.all(jnp.isfinite(x)) & jnp.all(jnp.abs(residual) < fine)
     sound = sound & (x[m] <= upper * (1 + fine)) & jnp.all(s[:, 0] >= -fine) & jnp.all(tail <= s[:, 0] + fine)
+    # The forces attain h(d) with unit effort: no idle contact would push harder, none pushes beyond its effort.
+    v, tail, _ = tails(d)
+    h = v[:, 0] + tail
+    value = jnp.max(h) if norm == "L1" else jnp.sum(jnp.maximum(h, 0.0))
+    sound = sound & (value <= x[m] * (1 + fine)) & jnp.all(s[:, 0] <= 1 + fine)
     return Touch(jnp.where(sound, d, near.direction), jnp.where(sound, s, near.forces), sound)

@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 
 import jaxgrasp as jg
 from jaxgrasp import Status
-from jaxgrasp.effort import effort_map, extreme_force, torque_lengths
+from jaxgrasp.effort import effort_map, extreme_force, scaled, torque_lengths
 
 
 def ball(rng, count, k, tilt=0.3):
@@ -41,6 +41,19 @@ def pyramid_epsilon(A, edges, outer):
     return float(-ConvexHull(np.concatenate(points)).equations[:, -1].max())
 
 
+def assert_touching(grasp, q):
+    """Where smooth, forces of unit effort inside their cones whose wrench is the worst one, ``upper * direction``."""
+    A = np.asarray(effort_map(grasp, q.torque_scale))
+    s = np.asarray(scaled(grasp, q.touching))
+    smooth = np.asarray(q.smooth)
+    effort = s[..., 0].sum(-1) if q.norm == "L1" else s[..., 0].max(-1)
+    assert (effort[smooth] <= 1 + 1e-8).all()
+    assert (np.linalg.norm(s[..., 1:], axis=-1) <= s[..., 0] + 1e-8)[smooth].all()
+    wrench = np.einsum("...kmn,...kn->...m", A, s)
+    worst = np.asarray(q.upper)[:, None] * np.asarray(q.direction)
+    np.testing.assert_allclose(wrench[smooth], worst[smooth], atol=1e-8)
+
+
 def test_the_bracket_is_narrow_and_opens_only_where_resistant(answer):
     resistant = np.asarray(answer.status) == Status.RESISTANT
     assert 20 < resistant.sum() < 60
@@ -51,6 +64,10 @@ def test_the_bracket_is_narrow_and_opens_only_where_resistant(answer):
     refuted = np.asarray(answer.status) == Status.NOT_RESISTANT
     assert refuted.sum() > 10
     assert (np.asarray(answer.upper)[refuted] == 0).all()
+
+
+def test_the_touching_forces_are_the_worst_wrench(grasp, answer):
+    assert_touching(grasp, answer)
 
 
 def test_the_checker_accepts_and_finds_every_fault(grasp, answer):
@@ -123,6 +140,7 @@ def test_linf_ball_is_resisted_and_no_larger_one():
     grasp = jg.Grasp(position, normal, jg.HardFinger(0.4))
     q = jg.epsilon_quality(grasp, "Linf", certificate=True)
     assert jg.check_certificate(grasp, q).all()
+    assert_touching(grasp, q)
     resistant = np.flatnonzero(np.asarray(q.status) == Status.RESISTANT)
     assert len(resistant) >= 20
     A = effort_map(grasp, torque_lengths(grasp))
@@ -179,6 +197,7 @@ def test_spatial_linf_against_support_directions_and_linear_programs():
     grasp = jg.Grasp(position, normal, jg.HardFinger(friction))
     resistant = np.flatnonzero(np.asarray(q.status) == Status.RESISTANT)
     assert len(resistant) >= 10
+    assert_touching(grasp, q)
     A = np.asarray(effort_map(grasp, torque_lengths(grasp)))
     direction = rng.normal(size=(100_000, 6))
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
@@ -283,6 +302,7 @@ def test_every_contact_model(norm, name):
     q = jg.epsilon_quality(grasp, norm, certificate=True)
     resistant = np.asarray(q.status) == Status.RESISTANT
     assert resistant.sum() >= 5
+    assert_touching(grasp, q)
     assert jg.check_certificate(grasp, q).all()
     assert np.mean(np.asarray(q.width)[resistant] <= 0.01) >= 0.99
 

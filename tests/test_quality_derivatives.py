@@ -123,31 +123,34 @@ def known(function):
 
 RESISTANT, REFUTED = Status.RESISTANT, Status.NOT_RESISTANT
 STEP = 1e-4
-# The differences must agree to 1e-6 of the sum of |gradient entry * change| and |value|.
+# The differences must agree to so much of the sum of |gradient entry * change| and |value|. The margin's solver leaves
+# forces and twists open to the root of its gap, 1e-6, times what the second derivative makes of it: up to 3e-5 here,
+# whatever the step. In the plane they are sharp.
+CLOSED, OPEN = 1e-6, 5e-5
 CASES = {
-    "epsilon L1, planar": (epsilon("L1"), planar),
-    "epsilon Linf, planar": (epsilon("Linf"), planar),
-    "epsilon L1, hard": (epsilon("L1"), scattered(4)),
-    "epsilon Linf, hard": (epsilon("Linf"), scattered(4)),
-    "epsilon L1, soft": (epsilon("L1"), scattered(3, (0.2, 0.5))),
-    "epsilon Linf, soft": (epsilon("Linf"), scattered(3, (0.2, 0.5))),
-    "critical friction, planar": (critical, planar),
-    "critical friction, hard": (critical, hard),
-    "critical friction, soft": (critical, soft),
-    "radius, planar": (radius(RESISTANT), planar),
-    "radius, hard": (radius(RESISTANT), hard),
-    "radius, soft": (radius(RESISTANT), soft),
-    "radius of a refuted grasp, planar": (radius(REFUTED), slippery(planar)),
-    "radius of a refuted grasp, hard": (radius(REFUTED), slippery(hard)),
-    "radius of a refuted grasp, soft": (radius(REFUTED), slippery(soft)),
-    "task L1, planar": (task("L1"), with_task(planar)),
-    "task Linf, planar": (task("Linf"), with_task(planar)),
-    "task L1, hard": (task("L1"), with_task(hard)),
-    "task Linf, soft": (task("Linf"), with_task(soft)),
-    "isotropy, hard": (known(jg.grasp_isotropy), hard),
-    "isotropy, soft": (known(jg.grasp_isotropy), soft),
-    "volume, planar": (known(jg.grasp_volume), planar),
-    "volume, hard": (known(jg.grasp_volume), hard),
+    "epsilon L1, planar": (epsilon("L1"), planar, CLOSED),
+    "epsilon Linf, planar": (epsilon("Linf"), planar, CLOSED),
+    "epsilon L1, hard": (epsilon("L1"), scattered(4), CLOSED),
+    "epsilon Linf, hard": (epsilon("Linf"), scattered(4), CLOSED),
+    "epsilon L1, soft": (epsilon("L1"), scattered(3, (0.2, 0.5)), CLOSED),
+    "epsilon Linf, soft": (epsilon("Linf"), scattered(3, (0.2, 0.5)), CLOSED),
+    "critical friction, planar": (critical, planar, CLOSED),
+    "critical friction, hard": (critical, hard, OPEN),
+    "critical friction, soft": (critical, soft, OPEN),
+    "radius, planar": (radius(RESISTANT), planar, CLOSED),
+    "radius, hard": (radius(RESISTANT), hard, OPEN),
+    "radius, soft": (radius(RESISTANT), lambda: apart(scattered(3, (0.2, 0.5))()), OPEN),
+    "radius of a refuted grasp, planar": (radius(REFUTED), slippery(planar), CLOSED),
+    "radius of a refuted grasp, hard": (radius(REFUTED), slippery(hard), OPEN),
+    "radius of a refuted grasp, soft": (radius(REFUTED), slippery(soft), OPEN),
+    "task L1, planar": (task("L1"), with_task(planar), CLOSED),
+    "task Linf, planar": (task("Linf"), with_task(planar), CLOSED),
+    "task L1, hard": (task("L1"), with_task(hard), CLOSED),
+    "task Linf, soft": (task("Linf"), with_task(soft), CLOSED),
+    "isotropy, hard": (known(jg.grasp_isotropy), hard, CLOSED),
+    "isotropy, soft": (known(jg.grasp_isotropy), soft, CLOSED),
+    "volume, planar": (known(jg.grasp_volume), planar, CLOSED),
+    "volume, hard": (known(jg.grasp_volume), hard, CLOSED),
 }
 FAST = (
     "epsilon L1, planar",
@@ -174,7 +177,7 @@ def differences(measure, x, t, step):
 )
 def test_gradient_against_differences(name):
     """A lane is left out where the measure says so, or where differences of two steps show a kink between them."""
-    measure, problem = CASES[name]
+    measure, problem, limit = CASES[name]
     x = as_arrays(problem())
     change = direction(x)
     value, smooth = (np.asarray(v) for v in measure(x))
@@ -189,4 +192,4 @@ def test_gradient_against_differences(name):
         fine = fine & smooth & (np.abs(wider - difference) < 1e-5 * size)
         assert fine.mean() >= 0.75, (key, fine)
         error = np.abs(terms.sum(axis=-1) - difference) / size
-        assert (error[fine] < 1e-6).all(), (key, error)
+        assert (error[fine] < limit).all(), (key, error)
