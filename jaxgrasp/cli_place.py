@@ -49,8 +49,9 @@ def place(
         str,
         typer.Option(help="What is maximised: margin, epsilon or epsilon-linf."),
     ] = "margin",
-    starts: Annotated[int, typer.Option(help="Random grasps to begin with.")] = 256,
-    steps: Annotated[int, typer.Option(help="Gradient steps of each at most.")] = 150,
+    starts: Annotated[int, typer.Option(help="Grasps to begin with.")] = 256,
+    candidates: Annotated[int, typer.Option(help="Random grasps that each of them is the best of.")] = 512,
+    steps: Annotated[int, typer.Option(help="Gradient steps of each climb at most.")] = 150,
     apart: Annotated[
         float | None, typer.Option(metavar="M", help="Least distance of any two contacts, m.")
     ] = None,
@@ -83,7 +84,7 @@ def place(
     remember_compilations()
     run = prepare(
         PlaceRequest(
-            source, output, unit, fingers, model, friction, torsion, objective, starts, steps, apart,
+            source, output, unit, fingers, model, friction, torsion, objective, starts, steps, candidates, apart,
             edge_clearance, jaw_width, best, seed, resolution, picture,
         )
     )  # fmt: skip

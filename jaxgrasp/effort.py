@@ -20,7 +20,16 @@ from ._types import Array, Float
 from .geometry import wrench_dimension
 from .grasp import Grasp, folded_grasp_map, length_scale
 
-__all__ = ["NORMS", "contact_support", "effort_map", "extreme_force", "scaled", "support", "torque_lengths"]
+__all__ = [
+    "NORMS",
+    "contact_support",
+    "effort_map",
+    "extreme_force",
+    "scaled",
+    "signed_supports",
+    "support",
+    "torque_lengths",
+]
 
 NORMS = ("L1", "Linf")
 
@@ -87,3 +96,15 @@ def support(A: Array, active: Array, norm: str, direction: Array) -> tuple[Array
     """``h(d)``, the outermost wrench (m,) of W along d, and its scaled forces (k, n)."""
     value, force = extreme_force(A, active, norm, direction)
     return value, jnp.einsum("kmn,kn->m", A, force), force
+
+
+def signed_supports(A: Array, active: Array, norm: str, direction: Array) -> Float[Array, "*batch D"]:
+    """``h`` of directions (*batch, D, m) for A (*batch, k, m, n); ``max_i h_i < 0`` where no contact pushes along d."""
+    v = jnp.einsum("...kmn,...dm->...dkn", A, direction)
+    square = jnp.sum(v[..., 1:] ** 2, axis=-1)
+    h = v[..., 0] + jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    h = jnp.where(active[..., None, :], h, -jnp.inf)
+    most = jnp.max(h, axis=-1)
+    if norm == "L1":
+        return most
+    return jnp.where(most > 0, jnp.sum(jnp.maximum(h, 0.0), axis=-1), most)

@@ -27,10 +27,11 @@ from .lanes import to_lanes, to_rows
 from .margin import Contacts, fold, margin_program
 from .solver import Stop
 from .solver.convex import Bounds, ConvexProgram, Point
-from .solver.implicit import centred, lagrangian, point_tangent, residuals
+from .solver.implicit import Shift, centring, lagrangian, point_tangent, residuals
 from .solver.linear import Cholesky
+from .solver.newton_matrix import newton_solve
 from .solver.stages import inlined
-from .tangents import kept, masked, safe_contacts, tiled_solver, zero_tangent
+from .tangents import kept, masked, safe_contacts, tiled, tiled_solver, zero_tangent
 from .verdict import Verdict, unfold
 
 __all__ = ["Solved", "differentiable"]
@@ -71,6 +72,15 @@ def _program(form: _Form, contacts: Contacts, scales: Scales) -> ConvexProgram:
     program = margin_program(fold(contacts, form.components, scales.length))
     none = (None,) * 7
     return ConvexProgram(program.columns, jnp.stack(program.rhs), program.exists, program.cost[0], *none)
+
+
+def _centring(form: _Form, contacts: Contacts, scales: Scales, point: Point) -> Shift:
+    program = _program(form, contacts, scales)
+    return centring(program, point, lambda rhs: newton_solve(program, point, scales.factor, rhs))
+
+
+def _added(a: Cone, b: Cone) -> Cone:
+    return tuple(x + y for x, y in zip(a, b, strict=True))
 
 
 def _internal_force(
@@ -134,8 +144,8 @@ def _tangents(form: _Form, result: Solved, contacts: Contacts, change: Any) -> S
     scales = jax.tree.map(lambda x: lax.stop_gradient(to_lanes(kept(ok, flat(x), 1.0))), result.scales)
     program = _program(form, data, scales)
     fixed = lax.stop_gradient((data, scales))
-    near = tiled_solver(partial(_program, form), *fixed, lax.stop_gradient(point), form.width)
-    point = centred(lax.stop_gradient(program), point, near)
+    shift = tiled(partial(_centring, form), fixed[0], (fixed[1], lax.stop_gradient(point)), form.width)
+    point = point._replace(y=point.y + shift.y, u=_added(point.u, shift.u), z=_added(point.z, shift.z))
     _, residual = jax.jvp(lambda c: residuals(_program(form, c, scales), point), (data,), (changes,))
     solver = tiled_solver(partial(_program, form), *fixed, lax.stop_gradient(point), form.width)
     moved = point_tangent(program, point, residual, solver)

@@ -2,58 +2,48 @@
 
     maximise  q(G(x(p)))  -  weight * sum of squared excesses,     x(p) the projection of p onto the surface
 
-q is any differentiable function of a ``Grasp``: the margin by default. Every step projects, solves, differentiates
-through solver and surface, and lets an optax optimiser move p. A start keeps the best point it has seen, stops when it
-no longer improves, and never disturbs the others. At the end contacts are put exactly onto a mesh's triangles, with the
-faces' own normals, and every grasp is solved and proved again there. Sources: the envelope theorem for the gradient;
-Zhu, Wang 2003 and Liu et al. 2021 (grasps by gradients of closure measures).
+q is any differentiable function of a ``Grasp``: the margin by default. A start is the best of many random grasps,
+which cost little to screen; its contacts climb the guide of q (the margin, for most), and from there q itself. At the
+end contacts are put exactly onto a mesh's triangles, with the faces' own normals, and every grasp is solved and proved
+again there. Sources: the envelope theorem for the gradient; Zhu, Wang 2003 and Liu et al. 2021 (grasps by gradients).
 """
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import permutations
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jax import lax
 
 from ._types import Array
 from .certificate import check_certificate
+from .climbing import climb
 from .contacts import ContactModel, HardFinger
 from .errors import UserError
 from .grasp import Grasp
-from .requirements import SLACK, Requirement
+from .objectives import FLOOR, Margin, Objective
+from .objectives import objective as as_objective
+from .requirements import SLACK, Requirement, total_excess
 from .resistance import WrenchResistance, wrench_resistance
 from .status import Status
-from .surfaces import MeshSurface, Surface
+from .surfaces import Surface
 
-__all__ = ["Placement", "PlacementProgress", "place_contacts"]
+__all__ = ["CANDIDATES", "Placement", "PlacementProgress", "place_contacts"]
 
-BLOCK = 256  # starts optimised together: one compilation
-CANDIDATES = 8  # random grasps a start is the best of
-PENALTY = 1e2  # per squared radius of excess
-PATIENCE, IMPROVEMENT = 15, 1e-3  # steps without that much improvement end a start
+CANDIDATES = 512  # random grasps a start is the best of
+GROUP = 64  # starts drawn together: memory follows it, not the number of starts
 DRAWS = 64  # rounds of random contacts before a region counts as empty
-FLOOR = -10.0  # margins below it (and -inf) count as it
-
-
-def margin(grasp: Grasp) -> Array:
-    """t*, at least -10 so that grasps without any internal force can be compared."""
-    return jnp.maximum(wrench_resistance(grasp).margin, FLOOR)
-
-
-Objective = Callable[[Grasp], Array]
+ADAM = optax.adam(0.05)  # of the radius a step; one object, hence one compilation
 
 
 class PlacementProgress(NamedTuple):
-    """How far a placement is: starts finished, of how many, and the best value so far."""
+    """How far a placement is: what it is doing, starts that are through with it, of how many, the best value so far."""
 
+    phase: str
     done: int
     starts: int
     best: float
@@ -69,6 +59,7 @@ class Placement:
     verdict   their ``WrenchResistance``         proved  (n,) bool: the independent checker accepted it
     before, after   (starts,) margins of every start and of where it ended
     resistant (starts,) bool: ended wrench resistant, with a certificate the checker accepts
+    origin, end (starts, k, 3) m: where every start began and ended, in the surface's own frame
     steps     (starts,) steps taken; a start with a NaN objective ends at its last good point
     excess    (starts,) m: how far the requirements are from being met; only grasps within them are in ``grasp``
     """
@@ -82,84 +73,14 @@ class Placement:
     before: np.ndarray
     after: np.ndarray
     resistant: np.ndarray
+    origin: np.ndarray
+    end: np.ndarray
     steps: np.ndarray
     excess: np.ndarray
 
 
-class _State(NamedTuple):
-    """Starts of a block: where they are, the best they saw, how long ago."""
-
-    point: Array  # (B, k, 3)
-    optimizer: Any
-    best: Array  # (B,) penalised objective
-    best_point: Array
-    waited: Array  # (B,) steps since it improved enough
-    steps: Array
-    alive: Array
-
-
-def _total_excess(
-    requirements: tuple[Requirement, ...], surface: Surface, position: Array, normal: Array
-) -> Array:
-    total = jnp.zeros(position.shape[:-2], position.dtype)
-    for requirement in requirements:
-        total = total + requirement.excess(surface, position, normal) ** 2
-    there = total > 0
-    return jnp.where(there, jnp.sqrt(jnp.where(there, total, 1.0)), 0.0)
-
-
-def _scores(objective: Objective, model: ContactModel, requirements, surface: Surface, point: Array) -> Array:
-    """(B,) objective less the penalty at points (B, k, 3) near the surface."""
-    position, normal = surface.contact(point)
-    value = objective(Grasp(position - surface.centre, normal, model))
-    excess = _total_excess(requirements, surface, position, normal) / surface.radius
-    return value - PENALTY * excess * excess
-
-
-@functools.lru_cache(maxsize=16)
-def _climber(objective: Objective, optimizer: optax.GradientTransformation, requirements, steps: int):
-    """A block of starts taken uphill, compiled once for each objective, optimiser and set of requirements."""
-
-    @jax.jit
-    def climb(surface: Surface, model: ContactModel, point: Array) -> _State:
-        def total(point: Array) -> tuple[Array, Array]:
-            scores = _scores(objective, model, requirements, surface, point)
-            return -jnp.sum(jnp.where(jnp.isfinite(scores), scores, 0.0)), scores
-
-        def step(state: _State) -> _State:
-            (_, scores), slope = jax.value_and_grad(total, has_aux=True)(state.point)
-            good = jnp.isfinite(scores) & jnp.all(jnp.isfinite(slope), axis=(1, 2))
-            much = scores > state.best + IMPROVEMENT * jnp.abs(state.best)
-            better = state.alive & good & (scores > state.best)
-            best_point = jnp.where(better[:, None, None], state.point, state.best_point)
-            waited = jnp.where(much & good, 0, state.waited + 1)
-            alive = state.alive & good & (waited < PATIENCE)
-            slope = jnp.where(alive[:, None, None], slope, 0.0)
-            with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
-                move, optimizer_state = optimizer.update(slope, state.optimizer, state.point)
-            moved = surface.project(state.point + jnp.asarray(move, state.point.dtype))
-            moved = jnp.where(alive[:, None, None] & jnp.isfinite(moved), moved, state.point)
-            best = jnp.where(better, scores, state.best)
-            return _State(
-                moved, optimizer_state, best, best_point, waited, state.steps + alive.astype(jnp.int32), alive
-            )
-
-        count = point.shape[0]
-        start = _State(
-            point, optimizer.init(point), jnp.full(count, -jnp.inf, point.dtype), point,
-            jnp.zeros(count, jnp.int32), jnp.zeros(count, jnp.int32), jnp.ones(count, bool),
-        )  # fmt: skip
-
-        def unfinished(carry: tuple[Array, _State]) -> Array:
-            return (carry[0] <= steps) & jnp.any(carry[1].alive)
-
-        return lax.while_loop(unfinished, lambda c: (c[0] + 1, step(c[1])), (jnp.int32(0), start))[1]
-
-    return climb
-
-
 def _draw(
-    surface: Surface, fingers: int, requirements, seed: int, count: int
+    surface: Surface, fingers: int, requirements: Sequence[Requirement], seeds: tuple[int, int], count: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Random contacts (count, k, 3) and normals within the requirements where they can be found."""
     kept: list[tuple[np.ndarray, np.ndarray]] = []
@@ -167,13 +88,14 @@ def _draw(
     limit = SLACK * float(surface.radius)
     total = 0
     for round_ in range(DRAWS if requirements else 1):
-        # A number of its own for each round, from the seed alone.
-        number = int(np.random.SeedSequence([seed, round_]).generate_state(1, np.uint32)[0])
+        # A number of its own for each group and round, from the seed alone.
+        number = int(np.random.SeedSequence([*seeds, round_]).generate_state(1, np.uint32)[0])
         point, normal = surface.sample(number, count * fingers)
         point, normal = point.reshape(count, fingers, 3), normal.reshape(count, fingers, 3)
         excess = np.zeros(count)
         if requirements:
-            excess = np.asarray(_total_excess(requirements, surface, jnp.asarray(point), jnp.asarray(normal)))
+            there = jnp.asarray(point), jnp.asarray(normal)
+            excess = np.asarray(total_excess(requirements, surface.traced, *there))
         good = excess <= limit
         kept.append((point[good], normal[good]))
         spare.append((point[~good], normal[~good], excess[~good]))
@@ -192,24 +114,63 @@ def _draw(
     return point[:count], normal[:count]
 
 
-def _starts(surface, fingers, model, requirements, seed, starts) -> tuple[np.ndarray, np.ndarray]:
-    """Points (S, k, 3), each the best of a few random grasps by its margin, and those margins."""
-    point, normal = _draw(surface, fingers, requirements, seed, starts * CANDIDATES)
-    grasp = Grasp(point - np.asarray(surface.centre), normal, model)
-    value = np.asarray(margin(grasp)).reshape(starts, CANDIDATES)
-    value = np.where(np.isfinite(value), value, -np.inf)
-    chosen = value.argmax(axis=1)
-    row = np.arange(starts)
-    return point.reshape(starts, CANDIDATES, fingers, 3)[row, chosen], value[row, chosen]
+class _Task(NamedTuple):
+    """What is asked, checked."""
+
+    surface: Surface
+    fingers: int
+    model: ContactModel
+    requirements: tuple[Requirement, ...]
+    starts: int
+    candidates: int
+    seed: int
+    tell: Callable[[PlacementProgress], None]
+
+    def about_centre(self, position: np.ndarray, normal: np.ndarray) -> Grasp:
+        return Grasp(position - np.asarray(self.surface.centre), normal, self.model)
 
 
-def _exactly(surface: Surface, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Contacts as they are on the real surface: a mesh's triangles and face normals."""
-    if isinstance(surface, MeshSurface):
-        near = surface.project_exact(point)
-        return near.point, near.normal
-    position, normal = surface.contact(point)
-    return np.asarray(position), np.asarray(normal)
+def _starts(task: _Task, guide: Objective) -> tuple[np.ndarray, np.ndarray]:
+    """Points (S, k, 3), each the best of a few random grasps by its guide, and their margins."""
+    points, margins = [], []
+    for group, first in enumerate(range(0, task.starts, GROUP)):
+        # Every group is drawn whole: a start does not depend on how many there are.
+        count = GROUP * task.candidates
+        seeds = (task.seed, group)
+        point, normal = _draw(task.surface, task.fingers, task.requirements, seeds, count)
+        grasp = task.about_centre(point, normal)
+        value = np.asarray(guide.value(grasp, guide.begin(grasp)))
+        value = np.where(np.isfinite(value), value, -np.inf).reshape(GROUP, task.candidates)
+        row = np.arange(min(GROUP, task.starts - first))
+        chosen = row * task.candidates + value.argmax(axis=1)[row]
+        points.append(point[chosen])
+        margins.append(np.maximum(np.asarray(wrench_resistance(grasp[chosen]).margin), FLOOR))
+        done = first + len(row)
+        task.tell(PlacementProgress("screening", done, task.starts, float(value[row].max())))
+    return np.concatenate(points), np.concatenate(margins)
+
+
+class _End(NamedTuple):
+    """Where starts ended: points (S, k, 3) on the smooth surface, (S,) values there, steps taken."""
+
+    point: np.ndarray
+    value: np.ndarray
+    steps: np.ndarray
+
+
+def _climbed(
+    task: _Task, objective: Objective, optimizer: optax.GradientTransformation, origin: np.ndarray, steps: int
+) -> _End:
+    end = _End(origin.copy(), np.full(len(origin), -np.inf), np.zeros(len(origin), int))
+    done, phase = 0, type(objective).__name__.lower()
+    for ended in climb(
+        task.surface.traced, task.model, objective, optimizer, task.requirements, origin, steps
+    ):
+        for one in ended:
+            end.point[one.start], end.value[one.start], end.steps[one.start] = one.point, one.value, one.steps
+        done += len(ended)
+        task.tell(PlacementProgress(phase, done, task.starts, float(end.value.max())))
+    return end
 
 
 def _distinct(position: np.ndarray, order: np.ndarray, most: int, apart: float) -> list[int]:
@@ -233,11 +194,12 @@ def place_contacts(
     surface: Surface,
     fingers: int = 3,
     model: ContactModel | None = None,
-    objective: Objective = margin,
+    objective: Objective | Callable[[Grasp], Array] | None = None,
     starts: int = 256,
     steps: int = 150,
     optimizer: optax.GradientTransformation | None = None,
     requirements: Sequence[Requirement] = (),
+    candidates: int = CANDIDATES,
     best: int = 16,
     distinct: float = 0.1,
     seed: int = 0,
@@ -248,69 +210,99 @@ def place_contacts(
     surface       where the contacts are (``surfaces.of("mug")``, a mesh, a shape)
     fingers       k, contacts of a grasp
     model         their contact model, by default ``HardFinger(0.5)``: one number each, or one per contact (k,)
-    objective     q: a differentiable function of a batch of grasps to (*batch,), such as the margin (default) or
-                  ``lambda g: jg.epsilon_quality(g, tolerance=0.1).upper``
-    starts        random starts, each the best of 8 random grasps by its margin
-    steps         of the optimiser at most; a start that no longer improves ends earlier
-    optimizer     an optax optimiser over points in m; by default Adam whose rate falls from 5 % of the radius
+    objective     q: ``objectives.Margin()`` (default), ``objectives.Epsilon(norm, torque_scale)``, or a differentiable
+                  function of a batch of grasps to (B,), such as ``lambda g: -jg.critical_friction(g).factor``. It is
+                  climbed from where the climb of its ``guide`` ended, which is the margin where it names no other:
+                  most measures are flat where a grasp does not hold
+    starts        random starts, each the best of ``candidates`` random grasps by the guide
+    steps         at most, of each climb; a start ends earlier when halving its steps helps no more
+    optimizer     an optax optimiser over contacts (k, 3) in units of the surface's radius, a state for each start; by
+                  default ``optax.adam(0.05)``. Its steps are halved where a start no longer improves
     requirements  ``Apart``, ``Within``, ``Beyond``, ``EdgeClearance``, ``JawWidth`` or your own ``Requirement``
     best          grasps to return at most, each ``distinct`` (of the radius) away from every better one
     seed          the same seed gives the same grasps
-    progress      called with a ``PlacementProgress`` after every block of starts
+    progress      called with a ``PlacementProgress`` as starts end
 
     UserError where no contact can meet the requirements; ValueError for wrong arguments. NaN in the objective ends
-    its own start alone.
+    its own start alone. A start whose climb ended in a grasp that does not hold on the exact surface keeps the grasp of
+    the guide's climb or, failing that, the one it began with.
     """
     if not isinstance(surface, Surface):
         raise ValueError(
             f"surface must be a jaxgrasp.surfaces.Surface such as surfaces.of('mug'), got {surface!r}"
         )
-    for name, value in (("fingers", fingers), ("starts", starts), ("steps", steps), ("best", best)):
+    counts = {"fingers": fingers, "starts": starts, "steps": steps, "candidates": candidates, "best": best}
+    for name, value in counts.items():
         if not isinstance(value, int | np.integer) or value < 1:
             raise ValueError(f"{name} must be an integer of 1 or more, got {value!r}")
     if not all(isinstance(r, Requirement) for r in requirements):
         raise ValueError("requirements must be jaxgrasp.requirements such as Apart(0.02)")
+    asked = Margin() if objective is None else as_objective(objective)
+    optimizer = ADAM if optimizer is None else optimizer
     model = HardFinger(0.5) if model is None else model
-    if optimizer is None:
-        optimizer = _default_optimizer(float(surface.radius), steps)
-    asked = tuple(requirements)
-    origin, before = _starts(surface, fingers, model, asked, seed, starts)
-    climb = _climber(objective, optimizer, asked, steps)
-    ends, taken = [], []
-    for first in range(0, starts, BLOCK):
-        block = origin[first : first + BLOCK]
-        missing = BLOCK - len(block)
-        padded = np.concatenate([block, np.repeat(block[:1], missing, axis=0)])
-        state = climb(surface, model, jnp.asarray(padded, surface.centre.dtype))
-        ends.append(np.asarray(state.best_point)[: len(block)])
-        taken.append(np.asarray(state.steps)[: len(block)])
-        if progress is not None:
-            top = float(np.max(np.asarray(state.best)[: len(block)]))
-            progress(PlacementProgress(min(first + BLOCK, starts), starts, top))
-    return _judged(
-        surface, model, objective, asked, np.concatenate(ends), before, np.concatenate(taken), best, distinct
-    )
+    tell = progress if progress is not None else lambda _: None
+    task = _Task(surface, fingers, model, tuple(requirements), starts, candidates, seed, tell)
+    guide = asked.guide()
+    origin, before = _starts(task, guide)
+    ends = [_climbed(task, guide, optimizer, origin, steps)]
+    if type(asked) is not type(guide):
+        ends.append(_climbed(task, asked, optimizer, ends[0].point, steps))
+    return _judged(task, asked, origin, before, ends, best, distinct)
 
 
-@functools.lru_cache(maxsize=16)
-def _default_optimizer(radius: float, steps: int) -> optax.GradientTransformation:
-    return optax.adam(optax.cosine_decay_schedule(0.05 * radius, steps, alpha=0.02))
+class _Exact(NamedTuple):
+    """Contacts on the exact surface, and what they are worth there."""
+
+    position: np.ndarray
+    normal: np.ndarray
+    margin: np.ndarray
+    resistant: np.ndarray
+    excess: np.ndarray
 
 
-def _judged(surface, model, objective, asked, end, before, steps, best, distinct) -> Placement:
-    """Exact contacts, verdicts and proofs of all starts; the best distinct ones among those within the requirements."""
-    position, normal = _exactly(surface, end)
-    grasp = Grasp(position - np.asarray(surface.centre), normal, model)
+def _exact(task: _Task, point: np.ndarray) -> _Exact:
+    position, normal = task.surface.exact_contact(point)
+    grasp = task.about_centre(position, normal)
     verdict = wrench_resistance(grasp)
-    proved = check_certificate(grasp, verdict)
-    value = np.asarray(objective(grasp))
-    excess = np.asarray(_total_excess(asked, surface, jnp.asarray(position), jnp.asarray(normal)))
-    allowed = np.isfinite(value) & (excess <= SLACK * float(surface.radius))
-    order = np.flatnonzero(allowed)
-    order = order[np.argsort(-value[order], kind="stable")]
-    chosen = np.array(_distinct(position, order, best, distinct * float(surface.radius)), int)
-    resistant = (np.asarray(verdict.status) == Status.RESISTANT) & proved
+    resistant = (np.asarray(verdict.status) == Status.RESISTANT) & check_certificate(grasp, verdict)
+    there = jnp.asarray(position), jnp.asarray(normal)
+    excess = np.asarray(total_excess(task.requirements, task.surface.traced, *there))
+    return _Exact(position, normal, np.asarray(verdict.margin), resistant, excess)
+
+
+def _judged(
+    task: _Task,
+    objective: Objective,
+    origin: np.ndarray,
+    before: np.ndarray,
+    ends: list[_End],
+    best: int,
+    distinct: float,
+) -> Placement:
+    """Exact contacts, verdicts and proofs of all starts; the best distinct ones among those within the requirements."""
+    limit = SLACK * float(task.surface.radius)
+    exact, value = _exact(task, ends[-1].point), ends[-1].value
+    # The exact surface is not quite the smooth one: what was lost there goes back to the guide's end, or to the start.
+    for earlier in (*(end.point for end in ends[-2::-1]), origin):
+        lost = ~(exact.resistant & (exact.excess <= limit))
+        if not lost.any():
+            break
+        before_it = _exact(task, earlier)
+        lost = lost & before_it.resistant & (before_it.excess <= limit)
+        pairs = zip(before_it, exact, strict=True)
+        exact = _Exact(*(np.where(lost.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs))
+        value = np.where(lost, -np.inf, value)
+    order = np.flatnonzero(np.isfinite(ends[-1].value) & (exact.excess <= limit))
+    order = order[np.lexsort((-value[order], ~exact.resistant[order]))]
+    chosen = np.array(_distinct(exact.position, order, best, distinct * float(task.surface.radius)), int)
+    grasp = task.about_centre(exact.position[chosen], exact.normal[chosen])
+    final = np.asarray(objective.final(grasp)) if len(chosen) else np.zeros(0)
+    again = np.lexsort((-final, np.isnan(final)))
+    chosen, final = chosen[again], final[again]
+    grasp = grasp[again]
+    verdict = wrench_resistance(grasp)
+    steps = np.sum([end.steps for end in ends], axis=0)
     return Placement(
-        grasp[chosen], position[chosen], value[chosen], chosen, jax.tree.map(lambda x: x[chosen], verdict),
-        proved[chosen], before, np.asarray(verdict.margin), resistant, steps, excess,
+        grasp, exact.position[chosen], final, chosen, verdict, check_certificate(grasp, verdict),
+        before, exact.margin, exact.resistant, origin, exact.position, steps, exact.excess,
     )  # fmt: skip

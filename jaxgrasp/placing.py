@@ -4,15 +4,13 @@ The request is checked before any work. The file has the columns of ``formats.pa
 number of its start as ``grasp_id``, and two more:
 
     objective      float64   what was maximised (metadata: ``objective``), at these contacts
-    margin_before  float64   margin of the random grasp that the row began as; null where it is -10 or less
+    margin_before  float64   margin of the random grasp that the row began as, the best of ``candidates``
 
-Only RESISTANT grasps within the requirements are written. What is maximised is a measure of grasps that hold; of those
-that do not, it is the margin, at most 0, so that gradients lead them to where they do.
+Only RESISTANT grasps within the requirements are written.
 """
 
 from __future__ import annotations
 
-import functools
 import importlib.util
 import time
 from collections.abc import Callable
@@ -25,14 +23,12 @@ import numpy as np
 import pyarrow as pa
 
 from . import meshes, objects
-from ._types import Array
 from .backend import precision
-from .epsilon import epsilon_quality
 from .errors import UserError
 from .formats.parquet import Contacts, Verdicts, read_row, schema, table, write
-from .grasp import Grasp
 from .loads import writable
-from .placement import FLOOR, Placement, PlacementProgress, margin, place_contacts
+from .objectives import FLOOR, Epsilon, Margin, Objective
+from .placement import CANDIDATES, Placement, PlacementProgress, place_contacts
 from .report import Verdict, draw
 from .requirements import Apart, EdgeClearance, JawWidth, Requirement
 from .run import MODELS, coefficients, provenance
@@ -45,32 +41,20 @@ PICTURES = (".png", ".svg", ".pdf")
 EXTRA = (("objective", pa.float64()), ("margin_before", pa.float64()))
 
 
-def _epsilon(grasp: Grasp, radius: float, norm: str) -> Array:
-    """The upper bound of a bracket of 10 %, sharpened: epsilon itself where its direction is isolated."""
-    return epsilon_quality(grasp, norm, torque_scale=radius, tolerance=0.1).upper
-
-
-# What --objective names: a function of grasps and of the object's radius in m.
-OBJECTIVES: dict[str, Callable[[Grasp, float], Array]] = {
-    "margin": lambda grasp, radius: margin(grasp),
-    "epsilon": lambda grasp, radius: _epsilon(grasp, radius, "L1"),
-    "epsilon-linf": lambda grasp, radius: _epsilon(grasp, radius, "Linf"),
+# What --objective names, for an object of a radius in m.
+OBJECTIVES: dict[str, Callable[[float], Objective]] = {
+    "margin": lambda radius: Margin(),
+    "epsilon": lambda radius: Epsilon("L1", radius),
+    "epsilon-linf": lambda radius: Epsilon("Linf", radius),
 }
 
 
-@functools.lru_cache(maxsize=16)  # one function for each name and radius, hence one compilation
-def objective_of(name: str, radius: float) -> Callable[[Grasp], Array]:
-    """The measure called ``name`` where a grasp holds, its margin (at most 0) where it does not."""
-    measure = OBJECTIVES[name]
-    if name == "margin":
-        return margin
-
-    def objective(grasp: Grasp) -> Array:
-        towards = jnp.minimum(margin(grasp), 0.0)
-        value = measure(grasp, radius)
-        return jnp.where((towards == 0) & (value > 0), value, towards)
-
-    return objective
+# What the user reads while it happens.
+PHASES = {
+    "margin": "climbing the margin",
+    "epsilonfloor": "climbing a bound of epsilon",
+    "epsilon": "climbing epsilon",
+}
 
 
 @dataclass(frozen=True)
@@ -90,6 +74,7 @@ class PlaceRequest:
     objective: str = "margin"
     starts: int = 256
     steps: int = 150
+    candidates: int = CANDIDATES
     apart: float | None = None
     edge_clearance: float | None = None
     jaw_width: float | None = None
@@ -131,7 +116,7 @@ class Placed:
 
 def prepare(request: PlaceRequest) -> PlaceRun:
     """Check the request, read its object. UserError: one line saying what to do."""
-    for name in ("fingers", "starts", "steps", "best"):
+    for name in ("fingers", "starts", "steps", "candidates", "best"):
         if getattr(request, name) < 1:
             raise UserError(f"--{name} must be at least 1, got {getattr(request, name)}")
     if request.resolution < 16:
@@ -193,6 +178,7 @@ def _metadata(request: PlaceRequest, body: meshes.Body, friction: float, torsion
         "torsion": torsion if request.model == "soft" else None,
         "objective": request.objective,
         "starts": request.starts,
+        "candidates": request.candidates,
         "steps": request.steps,
         **asked,
         "best": request.best,
@@ -224,21 +210,22 @@ def place(run: PlaceRun, progress: Callable[[str, int, str], None] | None = None
     tell, request, started = progress or (lambda *_: None), run.request, time.perf_counter()
 
     def climbed(so_far: PlacementProgress) -> None:
-        stage = "climbing" if so_far.done < so_far.starts else "proving"
-        tell(stage, so_far.done, f"best {request.objective} {so_far.best:.4g}")
+        doing = PHASES.get(so_far.phase, so_far.phase)
+        tell(doing, so_far.done, f"best {so_far.best:.4g}" if np.isfinite(so_far.best) else "")
 
     tell("measuring the object", 0, "")
     with precision("float64"):
         surface = MeshSurface.from_body(run.body, request.resolution)
-        tell("compiling, climbing", 0, "")
+        tell("screening", 0, "compiling")
         found = place_contacts(
             surface,
             request.fingers,
             MODELS[request.model]().with_coefficients(jnp.asarray(run.friction), jnp.asarray(run.torsion)),
-            objective_of(request.objective, float(surface.radius)),
+            OBJECTIVES[request.objective](float(surface.radius)),
             request.starts,
             request.steps,
             requirements=run.requirements,
+            candidates=request.candidates,
             best=request.best,
             seed=request.seed,
             progress=climbed,

@@ -7,16 +7,16 @@ minimises, and only grasps whose excess is within ``SLACK`` of the object's radi
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import combinations
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from ._types import Array, Float
-from .surfaces import Surface
+from .surfaces import SmoothSurface
 
-__all__ = ["SLACK", "Apart", "Beyond", "EdgeClearance", "JawWidth", "Requirement", "Within"]
+__all__ = ["SLACK", "Apart", "Beyond", "EdgeClearance", "JawWidth", "Requirement", "Within", "total_excess"]
 
 SLACK = 1e-3  # of the object's radius
 
@@ -25,7 +25,7 @@ class Requirement(eqx.Module):
     """Positions (.., k, 3) in m in the surface's frame, inward normals, and how far they are from what is asked."""
 
     @abc.abstractmethod
-    def excess(self, surface: Surface, position: Array, normal: Array) -> Float[Array, "*batch"]:
+    def excess(self, surface: SmoothSurface, position: Array, normal: Array) -> Float[Array, "*batch"]:
         """``sqrt(sum of squared violations)`` in m; 0 where satisfied."""
 
 
@@ -48,12 +48,22 @@ def _distances(position: Array) -> Array:
     return jnp.stack([_root(jnp.sum(d * d, axis=-1)) for d in apart], axis=-1)
 
 
+def total_excess(
+    requirements: Sequence[Requirement], surface: SmoothSurface, position: Array, normal: Array
+) -> Float[Array, "*batch"]:
+    """Root of the sum of squares of all excesses, m; its derivative is 0 where it is."""
+    total = jnp.zeros(position.shape[:-2], position.dtype)
+    for requirement in requirements:
+        total = total + requirement.excess(surface, position, normal) ** 2
+    return _root(total)
+
+
 class Apart(Requirement):
     """``|p_i - p_j| >= distance`` (m) for all pairs of contacts: fingers have a width."""
 
     distance: float
 
-    def excess(self, surface: Surface, position: Array, normal: Array) -> Float[Array, "*batch"]:
+    def excess(self, surface: SmoothSurface, position: Array, normal: Array) -> Float[Array, "*batch"]:
         if position.shape[-2] < 2:
             return jnp.zeros(position.shape[:-2], position.dtype)
         return _short(self.distance - _distances(position))
@@ -65,7 +75,7 @@ class JawWidth(Requirement):
     most: float
     least: float = 0.0
 
-    def excess(self, surface: Surface, position: Array, normal: Array) -> Float[Array, "*batch"]:
+    def excess(self, surface: SmoothSurface, position: Array, normal: Array) -> Float[Array, "*batch"]:
         width = _distances(position[..., :2, :])
         return _short(jnp.concatenate([width - self.most, self.least - width], axis=-1))
 
@@ -75,7 +85,7 @@ class EdgeClearance(Requirement):
 
     distance: float
 
-    def excess(self, surface: Surface, position: Array, normal: Array) -> Float[Array, "*batch"]:
+    def excess(self, surface: SmoothSurface, position: Array, normal: Array) -> Float[Array, "*batch"]:
         clear = surface.edge_distance(position)
         return _short(jnp.where(jnp.isfinite(clear), self.distance - clear, 0.0))
 
@@ -88,7 +98,7 @@ class Within(Requirement):
 
     inside: Callable[[Array], Array] = eqx.field(static=True)
 
-    def excess(self, surface: Surface, position: Array, normal: Array) -> Float[Array, "*batch"]:
+    def excess(self, surface: SmoothSurface, position: Array, normal: Array) -> Float[Array, "*batch"]:
         return _short(-jnp.vectorize(self.inside, signature="(d)->()")(position))
 
 
@@ -98,6 +108,6 @@ class Beyond(Requirement):
     centre: tuple[float, float, float]
     radius: float
 
-    def excess(self, surface: Surface, position: Array, normal: Array) -> Float[Array, "*batch"]:
+    def excess(self, surface: SmoothSurface, position: Array, normal: Array) -> Float[Array, "*batch"]:
         away = position - jnp.asarray(self.centre, position.dtype)
         return _short(self.radius - _root(jnp.sum(away * away, axis=-1)))

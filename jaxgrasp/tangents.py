@@ -16,7 +16,7 @@ from .solver.convex import ConvexProgram, Point
 from .solver.newton_matrix import Motion, newton_solve
 from .solver.stages import inlined, kernel
 
-__all__ = ["kept", "masked", "safe_contacts", "tiled_solver", "zero_tangent"]
+__all__ = ["kept", "masked", "safe_contacts", "tiled", "tiled_solver", "zero_tangent"]
 
 
 def zero_tangent(x: Array) -> Any:
@@ -54,29 +54,33 @@ def safe_contacts(ok: Array, contacts: Contacts) -> Contacts:
     )
 
 
-def tiled_solver(
-    program_of: Callable[[Any, Any], ConvexProgram], rows: Any, scales: Any, point: Point, width: int
-) -> Callable[[Motion], Motion]:
-    """``newton_solve`` at these points, a tile of ``width`` at a time; ``vmap`` adds rows. Lanes last outside.
+def tiled(function: Callable[..., Any], rows: Any, lanes: Any, width: int) -> Any:
+    """``function(rows, *lanes)`` in stages, a tile of ``width`` at a time; ``vmap`` adds rows. Lanes last outside.
 
-    ``program_of(rows, scales)`` is the program of A itself; the first leaf of ``rows`` is (N, k, .), and
-    ``scales.factor`` is the factor of A.
+    The first leaf of ``rows`` is (N, k, .). Nothing differentiates what is inside.
     """
 
     @kernel
-    def run(rows: Any, scales: Any, point: Point, rhs: Motion) -> Motion:
-        scales, point, rhs = jax.tree.map(to_lanes, (scales, point, rhs))
-        program = program_of(rows, scales)
-        return jax.tree.map(to_rows, newton_solve(program, point, scales.factor, rhs))
+    def run(rows: Any, lanes: Any) -> Any:
+        return jax.tree.map(to_rows, function(rows, *jax.tree.map(to_lanes, lanes)))
 
     def in_tiles(given: Any, count: Array, _: Array) -> Any:
         return map_tiles(lambda tile: run(*tile), given, count, width)
 
     solve = batched(in_tiles, lambda given: jax.tree.leaves(given)[0].shape[:-2], width)
+    with inlined(False):
+        return jax.tree.map(to_lanes, solve((rows, jax.tree.map(to_rows, lanes)), jnp.zeros((), jnp.int32)))
 
-    def solved(rhs: Motion) -> Motion:
-        given = jax.tree.map(to_rows, (scales, point, rhs))
-        with inlined(False):
-            return jax.tree.map(to_lanes, solve((rows, *given), jnp.zeros((), jnp.int32)))
 
-    return solved
+def tiled_solver(
+    program_of: Callable[[Any, Any], ConvexProgram], rows: Any, scales: Any, point: Point, width: int
+) -> Callable[[Motion], Motion]:
+    """``newton_solve`` at these points, ``tiled``.
+
+    ``program_of(rows, scales)`` is the program of A itself; ``scales.factor`` is the factor of A.
+    """
+
+    def solve(rows: Any, scales: Any, point: Point, rhs: Motion) -> Motion:
+        return newton_solve(program_of(rows, scales), point, scales.factor, rhs)
+
+    return lambda rhs: tiled(solve, rows, (scales, point, rhs), width)

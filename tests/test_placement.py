@@ -7,6 +7,7 @@ import pytest
 import jaxgrasp as jg
 from jaxgrasp import placement, surfaces
 from jaxgrasp.errors import UserError
+from jaxgrasp.objectives import Epsilon, EpsilonFloor
 from jaxgrasp.requirements import SLACK, Apart, Beyond, EdgeClearance, JawWidth, Requirement, Within
 
 
@@ -106,18 +107,56 @@ def test_a_start_without_numbers_ends_alone():
     assert (out.position[:, 0, 2] <= 0).all()
 
 
+def test_a_start_does_not_depend_on_how_many_there_are(placed):
+    out, _ = placed
+    fewer = placement.place_contacts(BALL, fingers=3, starts=10, steps=120, requirements=ASKED)
+    assert fewer.before.tobytes() == out.before[:10].tobytes()
+    assert fewer.end.tobytes() == out.end[:10].tobytes()
+
+
 @pytest.mark.slow
 def test_epsilon_as_the_objective_on_an_ellipsoid():
-    """Any measure of a grasp will do; the one climbed is the one that grows."""
+    """What is climbed grows, beyond what its guide reaches; the numbers are those of ``epsilon_quality``."""
     surface = surfaces.Ellipsoid(jnp.array([0.03, 0.04, 0.06]))
+    climbed = placement.place_contacts(surface, fingers=4, objective=Epsilon("L1", 0.06), starts=32)
+    guided = placement.place_contacts(surface, fingers=4, objective=EpsilonFloor(0.06), starts=32)
+    margin = placement.place_contacts(surface, fingers=4, starts=32)
+    assert climbed.resistant.all() and climbed.proved.all()
+    epsilon = [
+        np.asarray(
+            jg.epsilon_quality(
+                jg.Grasp(out.end, surface.normal(out.end), jg.HardFinger(0.5)), torque_scale=0.06
+            ).upper
+        )
+        for out in (margin, guided, climbed)
+    ]
+    median = np.median(epsilon, axis=1)
+    assert median[2] > 1.02 * median[1] > 1.1 * median[0]
+    again = jg.epsilon_quality(climbed.grasp, torque_scale=0.06)
+    np.testing.assert_allclose(climbed.value, again.upper, rtol=1e-9)
+    assert (np.diff(climbed.value) <= 0).all()
 
-    def quality(grasp):
-        return jg.epsilon_quality(grasp, torque_scale=0.06, tolerance=0.1).upper
 
-    climbed = placement.place_contacts(surface, fingers=4, objective=quality, starts=8, steps=25)
-    still = placement.place_contacts(surface, fingers=4, objective=quality, starts=8, steps=1)
-    assert np.median(climbed.value) > 1.1 * np.median(still.value)
-    assert climbed.proved.all()
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "measure",
+    [
+        lambda grasp: -jg.critical_friction(grasp).factor,
+        lambda grasp: jg.guaranteed_radius(grasp).radius,
+        jg.grasp_isotropy,
+    ],
+    ids=["critical friction", "guaranteed radius", "isotropy"],
+)
+def test_any_measure_climbs(measure):
+    surface = surfaces.Ellipsoid(jnp.array([0.03, 0.04, 0.06]))
+    climbed = placement.place_contacts(surface, objective=measure, starts=8, steps=40, candidates=32)
+    margin = placement.place_contacts(surface, starts=8, steps=40, candidates=32)
+
+    def median(out):
+        grasp = jg.Grasp(out.end, surface.normal(out.end), jg.HardFinger(0.5))
+        return np.median(np.asarray(measure(grasp)))
+
+    assert median(climbed) > median(margin)
 
 
 @pytest.mark.slow

@@ -26,8 +26,9 @@ from .._types import Array
 from ..cones import Cone, cone_min, cone_sum, inner
 from .convex import Bounds, ConvexProgram, Optional, Point
 from .newton_matrix import Motion, Newton, families, newton_at, newton_product, products, tail_size
+from .stages import stage
 
-__all__ = ["Residuals", "centred", "lagrangian", "point_tangent", "residuals"]
+__all__ = ["Residuals", "Shift", "centring", "lagrangian", "point_tangent", "residuals"]
 
 
 class Residuals(NamedTuple):
@@ -82,37 +83,44 @@ def lagrangian(program: ConvexProgram, point: Point) -> Array:
     return total
 
 
-def centred(program: ConvexProgram, point: Point, solve: Callable[[Motion], Motion]) -> Point:
-    """One Newton step of a program of cones alone towards ``u_i o z_i = mu e``, mu the mean product; held constant.
+class Shift(NamedTuple):
+    """What is added to the multipliers, the cones and their duals of a point."""
+
+    y: Array
+    u: Cone
+    z: Cone
+
+
+def centring(program: ConvexProgram, point: Point, solve: Callable[[Motion], Motion]) -> Shift:
+    """One Newton step of a program of cones alone towards ``u_i o z_i = mu e``, mu the mean product.
 
     A gap of g leaves the point open to the root of g across the central path, and derivatives with it; on the path
-    they are right to g. A step that leaves a cone is not taken.
+    they are right to g. A step that leaves a cone is not taken. In stages, which nothing differentiates.
     """
-    exists, u, z = program.exists, point.u, point.z
-    one = jnp.ones_like(exists)
+    x = solve(Motion(_off_centre(program.exists, point.u, point.z), jnp.zeros_like(point.y), None, None))
+    return _safe_shift(program, point, x)
+
+
+@stage
+def _off_centre(exists: Array, u: Cone, z: Cone) -> Cone:
+    """``mu u^-1 - z``."""
     mean = cone_sum(exists * inner(u, z)) / cone_sum(exists)
-    det = jnp.where(exists > 0, (u[0] - tail_size(u)) * (u[0] + tail_size(u)), one)
+    det = jnp.where(exists > 0, (u[0] - tail_size(u)) * (u[0] + tail_size(u)), jnp.ones_like(exists))
     pull = exists * mean / det
-    target = (
-        pull * u[0] - exists * z[0],
-        *(-pull * a - exists * b for a, b in zip(u[1:], z[1:], strict=True)),
-    )
-    x = solve(Motion(target, jnp.zeros_like(point.y), None, None))
-    dz = program.gradient(x.u, x.y, jnp.zeros_like(mean))
-    new_u = tuple(a + exists * b for a, b in zip(u, x.u, strict=True))
-    new_z = tuple(a + exists * b for a, b in zip(z, dz, strict=True))
-    good = jnp.isfinite(cone_sum(new_u[0] + new_z[0]))
-    for v in (new_u, new_z):
-        good = good & (cone_min(jnp.where(exists > 0, v[0] - tail_size(v), one)) > 0)
+    return (pull * u[0] - exists * z[0], *(-pull * a - exists * b for a, b in zip(u[1:], z[1:], strict=True)))
 
-    def moved(new: Array, old: Array) -> Array:
-        return old + lax.stop_gradient(jnp.where(good, new - old, jnp.zeros_like(old)))
 
-    return point._replace(
-        y=moved(point.y + x.y, point.y),
-        u=tuple(map(moved, new_u, u)),
-        z=tuple(map(moved, new_z, z)),
-    )
+@stage
+def _safe_shift(program: ConvexProgram, point: Point, x: Motion) -> Shift:
+    exists = program.exists
+    dz = program.gradient(x.u, x.y, jnp.zeros_like(exists[0]))
+    du = tuple(exists * a for a in x.u)
+    dz = tuple(exists * a for a in dz)
+    good = jnp.isfinite(cone_sum(du[0] + dz[0]))
+    for old, change in ((point.u, du), (point.z, dz)):
+        v = tuple(a + b for a, b in zip(old, change, strict=True))
+        good = good & (cone_min(jnp.where(exists > 0, v[0] - tail_size(v), jnp.ones_like(exists))) > 0)
+    return jax.tree.map(lambda a: jnp.where(good, a, jnp.zeros_like(a)), Shift(x.y, du, dz))
 
 
 def point_tangent(

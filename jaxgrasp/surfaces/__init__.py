@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Any
 from .gauge import Ellipsoid, Superquadric
 from .mesh import MeshSurface, NearestPoint
 from .rounded import Cylinder, RoundedBox, Sphere
-from .surface import Surface
+from .surface import SmoothSurface, Surface
 
 if TYPE_CHECKING:
     from ..meshes import Body
 
 __all__ = [
     "Surface",
+    "SmoothSurface",
     "Sphere",
     "Ellipsoid",
     "Superquadric",

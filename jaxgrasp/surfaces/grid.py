@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._types import Array, Float
+from .._types import Array, Float, Int
 from .nearest import TriangleSearch, pieces
 from .triangles import Triangles
 
@@ -34,23 +34,30 @@ def _weights(t: Array) -> tuple[Array, Array]:
 class DistanceGrid(eqx.Module):
     """Spline coefficients of a signed distance (channel 0, m) and of what belongs to the nearest point (the others).
 
-    coefficients  (nx, ny, nz, channels)
+    coefficients  (n, n, n, channels), those of the nodes (nx, ny, nz) in use first, so that all grids have one shape
+    used          (3,) int32: nx, ny, nz
     origin        (3,) the node (0, 0, 0), m
     spacing       () m
     """
 
-    coefficients: Float[Array, "nx ny nz channels"]
+    coefficients: Float[Array, "n n n channels"]
+    used: Int[Array, " 3"]
     origin: Float[Array, " 3"]
     spacing: Float[Array, ""]
 
+    @property
+    def sharp(self) -> bool:
+        """Whether there are sharp edges, whose distance is the last channel."""
+        return self.coefficients.shape[3] == CHANNELS
+
     def clamp(self, point: Float[Array, " 3"]) -> Array:
         """The point of the grid's inner box nearest to ``point``."""
-        last = jnp.asarray(self.coefficients.shape[:3], point.dtype) - 2
+        last = self.used.astype(point.dtype) - 2
         return jnp.clip(point, self.origin + self.spacing, self.origin + last * self.spacing)
 
     def _support(self, point: Array) -> tuple[Array, list[tuple[Array, Array]]]:
         u = (self.clamp(point) - self.origin) / self.spacing
-        last = jnp.asarray(self.coefficients.shape[:3], jnp.int32) - 3
+        last = self.used - 3
         cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(u)).astype(jnp.int32), 1, last)
         start = [cell[i] - 1 for i in range(3)] + [jnp.zeros((), jnp.int32)]
         block = jax.lax.dynamic_slice(
@@ -143,11 +150,14 @@ def distance_grid(triangles: Triangles, search: TriangleSearch, resolution: int)
     values[~near, 0] = sign[source] * np.linalg.norm(
         origin + spacing * rest - triangles.at(face, weight)[source], axis=1
     )
+    padded = np.zeros((resolution, resolution, resolution, channels), jnp.result_type(float))
+    inside = tuple(slice(n) for n in shape)
     for channel in range(channels):
-        values[..., channel] = ndimage.spline_filter(values[..., channel], order=3, mode="mirror")
-    dtype = jnp.result_type(float)
+        padded[(*inside, channel)] = ndimage.spline_filter(values[..., channel], order=3, mode="mirror")
+    dtype = padded.dtype
     return DistanceGrid(
-        jnp.asarray(values, dtype),
+        jnp.asarray(padded),
+        jnp.asarray(shape, jnp.int32),
         jnp.asarray(origin + triangles.middle, dtype),
         jnp.asarray(spacing, dtype),
     )

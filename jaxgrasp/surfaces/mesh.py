@@ -16,17 +16,18 @@ import numpy as np
 
 from .._types import Array, Float
 from ..errors import UserError
-from .grid import CHANNELS, DistanceGrid, distance_grid
+from .grid import DistanceGrid, distance_grid
 from .nearest import TriangleSearch
-from .surface import Surface, generator, unit_or
+from .surface import SmoothSurface, Surface, generator, unit_or
 from .triangles import Triangles
 
 if TYPE_CHECKING:
     from ..meshes import Body
 
-__all__ = ["MeshSurface", "NearestPoint"]
+__all__ = ["GridSurface", "MeshSurface", "NearestPoint"]
 
 STEPS = 6  # Newton steps of a projection: from within the band they end at rounding, thin parts apart
+SMALL_STEPS = 3  # of a retraction: it leaves the cube of the way, over curvature squared
 LEAST_SLOPE = 0.25  # of phi, squared, that a step divides by; 1 on the surface
 PROBES = 4000  # points of the mesh at which a new grid is tried
 MOST_LOST = 0.25  # share of them that may be lost before the grid is refused
@@ -52,6 +53,48 @@ class NearestPoint:
     distance: np.ndarray
 
 
+class GridSurface(SmoothSurface):
+    """The zero level of a spline: what of a mesh runs inside jit, without its triangles.
+
+    All meshes of one resolution have the same shapes of arrays (with sharp edges or without), hence one program.
+    """
+
+    grid: DistanceGrid
+    centre: Float[Array, " 3"]
+    radius: Float[Array, ""]
+
+    def _on(self, point: Array, steps: int = STEPS) -> Array:
+        x = self.grid.clamp(point)
+        for _ in range(steps):
+            value, slope = self.grid.distance_and_gradient(x)
+            square = jnp.sum(slope * slope)
+            x = x - value * slope / jnp.maximum(square, jnp.full_like(square, LEAST_SLOPE))
+        return x
+
+    def _contact(self, point: Float[Array, " 3"]) -> tuple[Array, Array]:
+        x = self._on(point)
+        return x, self._normal_on(x)
+
+    def _retract(self, point: Float[Array, " 3"]) -> Array:
+        return self._on(point, SMALL_STEPS)
+
+    def _tangent_normal(self, x: Float[Array, " 3"]) -> Array:
+        return unit_or(self.grid.distance_and_gradient(x)[1], jnp.asarray([0.0, 0.0, 1.0], x.dtype))[0]
+
+    def _normal_on(self, x: Float[Array, " 3"]) -> Array:
+        return unit_or(-self.grid.values(x)[1:4], jnp.asarray([0.0, 0.0, 1.0], x.dtype))[0]
+
+    def _distance(self, point: Float[Array, " 3"]) -> Array:
+        inner = self.grid.clamp(point)
+        beyond = unit_or(point - inner, jnp.zeros_like(point))[1]
+        return self.grid.distance_and_gradient(inner)[0] + beyond
+
+    def _edge_distance(self, point: Float[Array, " 3"]) -> Array:
+        if not self.grid.sharp:
+            return super()._edge_distance(point)
+        return self.grid.values(self._on(point))[4]
+
+
 class MeshSurface(Surface):
     """The surface of a mesh, on which contacts can be moved by gradients and then put exactly.
 
@@ -60,7 +103,7 @@ class MeshSurface(Surface):
     centre      (3,) centre of mass, m; by default that of the volume inside, of the surface where the mesh is open
     crease      rad: an edge is sharp where its faces' normals differ by more; the rim of an open mesh is sharp
 
-    grid        the spline, about 5 x 8 bytes a node in float64: 35 MB for a cube at 96
+    grid        the spline, a cube of nodes, 5 x 8 bytes each in float64: 35 MB at 96
     lost        share of the surface's area that the grid does not resolve: walls thinner than about two cells
     warnings    sentences for the user, each naming its consequence
 
@@ -75,9 +118,7 @@ class MeshSurface(Surface):
     resolution cannot resolve; ValueError for wrong arguments.
     """
 
-    grid: DistanceGrid
-    centre: Float[Array, " 3"]
-    radius: Float[Array, ""]
+    smooth: GridSurface
     triangles: Triangles = eqx.field(static=True)
     search: TriangleSearch = eqx.field(static=True)
     lost: float = eqx.field(static=True)
@@ -90,13 +131,13 @@ class MeshSurface(Surface):
             raise ValueError(f"crease must be an angle between 0 and pi rad, got {crease!r}")
         self.triangles = Triangles(mesh.vertices, mesh.faces, crease)
         self.search = TriangleSearch(self.triangles.corner)
-        self.grid = distance_grid(self.triangles, self.search, int(resolution))
+        grid = distance_grid(self.triangles, self.search, int(resolution))
         middle = self.triangles.centre if centre is None else np.asarray(centre, np.float64)
         if middle.shape != (3,) or not np.isfinite(middle).all():
             raise ValueError(f"centre must be three finite numbers in m, got {centre!r}")
-        dtype = self.grid.origin.dtype
-        self.centre = jnp.asarray(middle, dtype)
-        self.radius = jnp.asarray(self.triangles.farthest(middle), dtype)
+        dtype = grid.origin.dtype
+        radius = jnp.asarray(self.triangles.farthest(middle), dtype)
+        self.smooth = GridSurface(centre=jnp.asarray(middle, dtype), radius=radius, grid=grid)
         self.lost = self._lost()
         self.warnings = self._words(int(resolution))
 
@@ -104,6 +145,26 @@ class MeshSurface(Surface):
     def from_body(cls, body: Body, resolution: int = 96, crease: float = np.pi / 6) -> MeshSurface:
         """The surface of a body, about the body's own centre of mass."""
         return cls(body.mesh, resolution, body.centre_of_mass, crease)
+
+    @property
+    def grid(self) -> DistanceGrid:
+        """The spline's coefficients and where they lie."""
+        return self.smooth.grid
+
+    @property
+    def centre(self) -> Array:
+        return self.smooth.centre
+
+    @property
+    def radius(self) -> Array:
+        return self.smooth.radius
+
+    @property
+    def traced(self) -> GridSurface:
+        return self.smooth
+
+    def _contact(self, point: Float[Array, " 3"]) -> tuple[Array, Array]:
+        return self.smooth._contact(point)
 
     def _lost(self) -> float:
         """Share of the area that the spline misses by half a cell, or sees with its sides swapped."""
@@ -127,31 +188,6 @@ class MeshSurface(Surface):
                 "leave the rim unless edge_distance keeps them"
             )
         return tuple(words)
-
-    def _on(self, point: Array) -> Array:
-        x = self.grid.clamp(point)
-        for _ in range(STEPS):
-            value, slope = self.grid.distance_and_gradient(x)
-            square = jnp.sum(slope * slope)
-            x = x - value * slope / jnp.maximum(square, jnp.full_like(square, LEAST_SLOPE))
-        return x
-
-    def _contact(self, point: Float[Array, " 3"]) -> tuple[Array, Array]:
-        x = self._on(point)
-        return x, self._normal_on(x)
-
-    def _normal_on(self, x: Float[Array, " 3"]) -> Array:
-        return unit_or(-self.grid.values(x)[1:4], jnp.asarray([0.0, 0.0, 1.0], x.dtype))[0]
-
-    def _distance(self, point: Float[Array, " 3"]) -> Array:
-        inner = self.grid.clamp(point)
-        beyond = unit_or(point - inner, jnp.zeros_like(point))[1]
-        return self.grid.distance_and_gradient(inner)[0] + beyond
-
-    def _edge_distance(self, point: Float[Array, " 3"]) -> Array:
-        if self.grid.coefficients.shape[3] < CHANNELS:
-            return super()._edge_distance(point)
-        return self.grid.values(self._on(point))[4]
 
     def project_exact(self, point: Any) -> NearestPoint:
         """``argmin_x |x - p|`` over the triangles, exact to rounding, on the host: points (*batch, 3) in m.
@@ -179,6 +215,10 @@ class MeshSurface(Surface):
             shaped(weight),
             shaped(distance),
         )
+
+    def exact_contact(self, point: Any) -> tuple[np.ndarray, np.ndarray]:
+        near = self.project_exact(point)
+        return near.point, near.normal
 
     def sample(self, seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Points (count, 3) in m on the triangles, uniform over the area, with the faces' own inward normals: exact."""

@@ -21,6 +21,7 @@ from .._types import Array, Float
 from ..geometry import contact_frame
 
 __all__ = [
+    "SmoothSurface",
     "Surface",
     "centre_or_origin",
     "directions",
@@ -97,8 +98,8 @@ def unit_or(v: Float[Array, " d"], other: Float[Array, " d"]) -> tuple[Array, Ar
     return jnp.where(there, v / length, other), jnp.where(there, length, jnp.zeros_like(length))
 
 
-class Surface(eqx.Module):
-    """A closed surface in metres, on which contacts may be moved.
+class SmoothSurface(eqx.Module):
+    """A closed surface in metres as a compiled program sees it: what may be differentiated, and nothing else.
 
     centre  (3,) centre of mass, m
     radius  () largest distance of the surface from it, m
@@ -119,6 +120,20 @@ class Surface(eqx.Module):
         """Inward unit normal at a point of the surface, and some smooth continuation of it off the surface."""
         return self._contact(x)[1]
 
+    def _retract(self, point: Float[Array, " 3"]) -> Array:
+        """A point of the surface, for one that is near it: ``_contact`` where nothing cheaper is known."""
+        return self._contact(point)[0]
+
+    def _tangent_normal(self, x: Float[Array, " 3"]) -> Array:
+        """A unit normal of the surface that ``_contact`` projects onto, at a point of it."""
+        return self._normal_on(x)
+
+    def _slide(self, point: Float[Array, " 3"]) -> tuple[Array, Array]:
+        across = jax.lax.stop_gradient(self._tangent_normal(point))
+        change = point - jax.lax.stop_gradient(point)
+        x = jax.lax.stop_gradient(point) + change - across * jnp.sum(across * change)
+        return x, self._normal_on(x)
+
     def _edge_distance(self, point: Float[Array, " 3"]) -> Array:
         return jnp.full((), jnp.inf, point.dtype)
 
@@ -136,7 +151,12 @@ class Surface(eqx.Module):
         return jnp.stack([mean - spread, mean + spread])
 
     def _answer(self, question: str, shape: str, point: Any) -> Any:
-        return _lanes(self, question, shape, _points(point, self.centre.dtype))
+        return _lanes(self.traced, question, shape, _points(point, self.centre.dtype))
+
+    @property
+    def traced(self) -> SmoothSurface:
+        """What to hand to a jitted function: equal shapes of arrays, equal programs."""
+        return self
 
     def contact(self, point: Any) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch 3"]]:
         """``project`` and ``normal`` at the price of one of them."""
@@ -145,6 +165,14 @@ class Surface(eqx.Module):
     def project(self, point: Any) -> Float[Array, "*batch 3"]:
         """``argmin_x |x - p|`` over the surface, m; a fixed one of them where several are nearest."""
         return self.contact(point)[0]
+
+    def slide(self, point: Any) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch 3"]]:
+        """``contact`` for points that are on the surface: ``dx/dp = T T^T``, at a fraction of the price."""
+        return self._answer("_slide", "(d),(d)", point)
+
+    def retract(self, point: Any) -> Float[Array, "*batch 3"]:
+        """A point of the surface for points near it, such as after a small step: nearly ``project``, cheaper."""
+        return self._answer("_retract", "(d)", point)
 
     def normal(self, point: Any) -> Float[Array, "*batch 3"]:
         """Inward unit normal at ``project(point)``; on the surface its derivative is minus the shape operator."""
@@ -166,6 +194,10 @@ class Surface(eqx.Module):
         """Distance of ``project(point)`` to the nearest sharp edge, m; infinite where the surface has none."""
         return self._answer("_edge_distance", "()", point)
 
+
+class Surface(SmoothSurface):
+    """A ``SmoothSurface`` of which the host knows more: random points, and where contacts really are."""
+
     @abc.abstractmethod
     def sample(self, seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
         """``count`` points (count, 3) in m, uniform over the area, and inward unit normals there.
@@ -173,9 +205,14 @@ class Surface(eqx.Module):
         On the host, in float64; the same seed gives the same bytes. ValueError for a negative seed or count.
         """
 
+    def exact_contact(self, point: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (*batch, 3) in m and inward normals of contacts on the real surface, for a mesh its triangles."""
+        position, normal = self.contact(point)
+        return np.asarray(position), np.asarray(normal)
+
 
 @partial(jax.jit, static_argnums=(1, 2))
-def _lanes(surface: Surface, question: str, shape: str, point: Array) -> Any:
+def _lanes(surface: SmoothSurface, question: str, shape: str, point: Array) -> Any:
     """One compilation a shape: a call outside jit would otherwise compile its loops anew each time."""
 
     def lane(p: Array) -> Any:
