@@ -50,7 +50,7 @@ def place(
         typer.Option(help="What is maximised: margin, epsilon or epsilon-linf."),
     ] = "margin",
     starts: Annotated[int, typer.Option(help="Grasps to begin with.")] = 256,
-    candidates: Annotated[int, typer.Option(help="Random grasps that each of them is the best of.")] = 512,
+    candidates: Annotated[int, typer.Option(help="Random grasps that each of them is the best of.")] = 2048,
     steps: Annotated[int, typer.Option(help="Gradient steps of each climb at most.")] = 150,
     apart: Annotated[
         float | None, typer.Option(metavar="M", help="Least distance of any two contacts, m.")

@@ -46,8 +46,8 @@ class EpsilonQuality(eqx.Module):
     direction    (*batch, m) unit (F; tau / torque_scale): where the grasp is weakest. The load -direction is the worst
                  wrench; where not resistant the load along which nothing is resisted
     touching     (*batch, k n) forces of unit effort behind the worst wrench, about ``upper * direction``
-    smooth       bool: ``upper`` is h at an isolated weakest direction, to rounding, and the derivative is exact:
-                 epsilon's own unless another direction within the bracket is weaker still (with "Linf", 1 in 200).
+    smooth       bool: ``upper`` is the value at an isolated weakest direction, to rounding, its derivative exact:
+                 epsilon's own, unless another direction within the bracket is weaker still (with "Linf", 1 in 200).
                  Elsewhere the derivative is one finite choice, good to about the root of the bracket
     forces       (*batch, V, k n) unit effort each: the vertices of the polytope; zero beyond the last
     facets       (*batch, F, m) int32 vertex numbers; -1 beyond the last. Together they surround the origin

@@ -28,6 +28,7 @@ from .resistance import wrench_resistance
 
 __all__ = ["FLOOR", "Epsilon", "EpsilonFloor", "Margin", "Measure", "Objective", "objective"]
 
+LESSONS = 4  # of a memory, for a rough value
 FLOOR = -10.0  # margins below it (and -inf) count as it
 
 
@@ -56,6 +57,13 @@ class Objective(eqx.Module):
     @abc.abstractmethod
     def value(self, grasp: Grasp, memory: Any) -> Float[Array, " B"]:
         """What is climbed, as far as the memory knows."""
+
+    def rough(self, grasp: Grasp) -> Float[Array, " B"]:
+        """The values of grasps not seen before, after a few lessons: good enough to choose between them."""
+        memory = self.begin(grasp)
+        if self.interval > 1:
+            memory = lax.fori_loop(0, LESSONS, lambda _, m: self.learn(grasp, m), memory)
+        return self.value(grasp, memory)
 
     def final(self, grasp: Grasp) -> Float[Array, " B"]:
         """The values to report."""

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from itertools import permutations
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -34,7 +35,7 @@ from .surfaces import Surface
 
 __all__ = ["CANDIDATES", "Placement", "PlacementProgress", "place_contacts"]
 
-CANDIDATES = 512  # random grasps a start is the best of
+CANDIDATES = 2048  # random grasps a start is the best of
 GROUP = 64  # starts drawn together: memory follows it, not the number of starts
 DRAWS = 64  # rounds of random contacts before a region counts as empty
 ADAM = optax.adam(0.05)  # of the radius a step; one object, hence one compilation
@@ -224,8 +225,7 @@ def place_contacts(
     progress      called with a ``PlacementProgress`` as starts end
 
     UserError where no contact can meet the requirements; ValueError for wrong arguments. NaN in the objective ends
-    its own start alone. A start whose climb ended in a grasp that does not hold on the exact surface keeps the grasp of
-    the guide's climb or, failing that, the one it began with.
+    its own start alone. Of its ends and its beginning, a start keeps what is best on the exact surface.
     """
     if not isinstance(surface, Surface):
         raise ValueError(
@@ -258,16 +258,35 @@ class _Exact(NamedTuple):
     margin: np.ndarray
     resistant: np.ndarray
     excess: np.ndarray
+    value: np.ndarray  # rough
 
 
-def _exact(task: _Task, point: np.ndarray) -> _Exact:
+@jax.jit
+def _rough(objective: Objective, grasp: Grasp) -> Array:
+    return objective.rough(grasp)
+
+
+def _exact(task: _Task, objective: Objective, point: np.ndarray) -> _Exact:
     position, normal = task.surface.exact_contact(point)
     grasp = task.about_centre(position, normal)
     verdict = wrench_resistance(grasp)
     resistant = (np.asarray(verdict.status) == Status.RESISTANT) & check_certificate(grasp, verdict)
     there = jnp.asarray(position), jnp.asarray(normal)
     excess = np.asarray(total_excess(task.requirements, task.surface.traced, *there))
-    return _Exact(position, normal, np.asarray(verdict.margin), resistant, excess)
+    margin = np.asarray(verdict.margin)
+    if isinstance(objective, Margin):
+        return _Exact(position, normal, margin, resistant, excess, margin)
+    parts = [position[i : i + GROUP] for i in range(0, len(position), GROUP)]
+    turned = [normal[i : i + GROUP] for i in range(0, len(position), GROUP)]
+    value = [
+        _rough(objective, task.about_centre(_full(p), _full(n))) for p, n in zip(parts, turned, strict=True)
+    ]
+    return _Exact(position, normal, margin, resistant, excess, np.concatenate(value)[: len(position)])
+
+
+def _full(x: np.ndarray) -> np.ndarray:
+    """A group of one size, so that one program serves all."""
+    return np.concatenate([x, np.repeat(x[:1], GROUP - len(x), axis=0)])
 
 
 def _judged(
@@ -281,18 +300,20 @@ def _judged(
 ) -> Placement:
     """Exact contacts, verdicts and proofs of all starts; the best distinct ones among those within the requirements."""
     limit = SLACK * float(task.surface.radius)
-    exact, value = _exact(task, ends[-1].point), ends[-1].value
-    # The exact surface is not quite the smooth one: what was lost there goes back to the guide's end, or to the start.
-    for earlier in (*(end.point for end in ends[-2::-1]), origin):
-        lost = ~(exact.resistant & (exact.excess <= limit))
-        if not lost.any():
-            break
-        before_it = _exact(task, earlier)
-        lost = lost & before_it.resistant & (before_it.excess <= limit)
-        pairs = zip(before_it, exact, strict=True)
-        exact = _Exact(*(np.where(lost.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs))
-        value = np.where(lost, -np.inf, value)
-    order = np.flatnonzero(np.isfinite(ends[-1].value) & (exact.excess <= limit))
+
+    def worth(x: _Exact) -> np.ndarray:
+        held = x.resistant & (x.excess <= limit)
+        return np.where(held & np.isfinite(x.value), x.value, -np.inf)
+
+    # The exact surface is not quite the smooth one: a climb may lose there what it won, and its start be better.
+    exact = _exact(task, objective, ends[-1].point)
+    for earlier in (*(end.point for end in ends[:-1]), origin):
+        other = _exact(task, objective, earlier)
+        better = worth(other) > worth(exact)
+        pairs = zip(other, exact, strict=True)
+        exact = _Exact(*(np.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs))
+    value = exact.value
+    order = np.flatnonzero(np.isfinite(value) & (exact.excess <= limit))
     order = order[np.lexsort((-value[order], ~exact.resistant[order]))]
     chosen = np.array(_distinct(exact.position, order, best, distinct * float(task.surface.radius)), int)
     grasp = task.about_centre(exact.position[chosen], exact.normal[chosen])
