@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 
 import jaxgrasp as jg
 from jaxgrasp import Status
-from jaxgrasp.effort import effort_map, extreme_force, scaled, torque_lengths
+from jaxgrasp.effort import effort_map, scaled, torque_lengths
 
 
 def ball(rng, count, k, tilt=0.3):
@@ -112,11 +112,12 @@ def test_a_hundred_grasps_against_pyramids_of_32_edges():
 
 
 def two_planar(mu):
-    """Opposite fingers at (-1, 0) and (1, 0)."""
-    position = np.array([[-1.0, 0.0], [1.0, 0.0]])
-    return jg.Grasp(position, -position, jg.HardFinger(mu))
+    """Opposite fingers at (-1, 0) and (1, 0), and two places left empty."""
+    position = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
+    return jg.Grasp(position, -position, jg.HardFinger(mu), np.array([True, True, False, False]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mu", [0.2, 1.0])
 def test_two_opposite_planar_fingers(mu):
     """W is the tetrahedron of (1, +-mu, -+mu), (-1, +-mu, +-mu): its faces lie at mu / sqrt(mu^2 + 2)."""
@@ -129,41 +130,6 @@ def test_two_opposite_planar_fingers(mu):
     both = jg.epsilon_quality(two_planar(mu), "Linf", certificate=True)
     assert float(both.lower) >= exact * (1 - 1e-9)
     assert jg.check_certificate(two_planar(mu), both)
-
-
-def test_linf_ball_is_resisted_and_no_larger_one():
-    """The lower ball by optimal forces of another solver of ours, the upper bound by 10^5 support directions."""
-    rng = np.random.default_rng(3)
-    angle = np.sort(rng.uniform(0, 2 * np.pi, (40, 4)), axis=-1)
-    position = np.stack([np.cos(angle), np.sin(angle)], -1)
-    normal = -position + 0.3 * rng.normal(size=position.shape)
-    grasp = jg.Grasp(position, normal, jg.HardFinger(0.4))
-    q = jg.epsilon_quality(grasp, "Linf", certificate=True)
-    assert jg.check_certificate(grasp, q).all()
-    assert_touching(grasp, q)
-    resistant = np.flatnonzero(np.asarray(q.status) == Status.RESISTANT)
-    assert len(resistant) >= 20
-    A = effort_map(grasp, torque_lengths(grasp))
-    direction = rng.normal(size=(100_000, 3))
-    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-    least = jax.jit(
-        lambda a, on: jnp.min(jax.vmap(lambda d: extreme_force(a, on, "Linf", d)[0])(jnp.asarray(direction)))
-    )
-    for i in resistant:
-        seen = float(least(A[i], grasp.active[i]))
-        assert float(q.lower[i]) <= seen * (1 + 1e-9)
-        assert float(q.upper[i]) <= seen * (1 + 1e-9)  # the weakest of 10^5 directions is no weaker
-    length = np.asarray(q.torque_scale)[resistant, None, None]
-    others = np.broadcast_to(direction[:300], (len(resistant), 300, 3))
-    loads = np.concatenate([-np.asarray(q.direction)[resistant][:, None], others], 1)
-    loads = (
-        loads
-        * np.asarray(q.lower)[resistant, None, None]
-        * np.concatenate([np.ones_like(length), np.ones_like(length), length], -1)
-    )
-    out = jg.task_quality(grasp[resistant], loads, "Linf")
-    assert (np.asarray(out.effort) <= 1 + 1e-6).all()
-    assert (np.asarray(out.effort)[:, 0] >= 0.98).all()  # the worst wrench takes it all
 
 
 def resisted_multiple(wide, limits, equal, w):
@@ -181,6 +147,34 @@ def resisted_multiple(wide, limits, equal, w):
 
 
 @pytest.mark.slow
+def test_linf_ball_is_resisted_and_no_larger_one():
+    """The lower ball by linear programs, exact in the plane, the upper bound by 10^5 support directions."""
+    rng = np.random.default_rng(3)
+    angle = np.sort(rng.uniform(0, 2 * np.pi, (40, 4)), axis=-1)
+    position = np.stack([np.cos(angle), np.sin(angle)], -1)
+    normal = -position + 0.3 * rng.normal(size=position.shape)
+    grasp = jg.Grasp(position, normal, jg.HardFinger(0.4))
+    q = jg.epsilon_quality(grasp, "Linf", certificate=True)
+    assert jg.check_certificate(grasp, q).all()
+    assert_touching(grasp, q)
+    resistant = np.flatnonzero(np.asarray(q.status) == Status.RESISTANT)
+    assert len(resistant) >= 20
+    A = np.asarray(effort_map(grasp, torque_lengths(grasp)))
+    direction = rng.normal(size=(100_000, 3))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    effort = np.repeat(np.eye(4), 2, axis=1)
+    for i in resistant:
+        lower, upper, worst = float(q.lower[i]), float(q.upper[i]), np.asarray(q.direction[i])
+        v = np.einsum("kmn,dm->dkn", A[i], direction)
+        support = np.maximum(v[..., 0] + np.abs(v[..., 1]), 0).sum(-1).min()
+        assert lower <= upper * (1 + 1e-9) <= support * (1 + 2e-9)  # none of 10^5 directions is weaker
+        edges = np.stack([A[i][..., 0] + A[i][..., 1], A[i][..., 0] - A[i][..., 1]], 1).reshape(-1, 3).T
+        for w in direction[:30]:
+            assert resisted_multiple(edges, effort, np.ones(4), w) >= lower * (1 - 1e-7)
+        least = resisted_multiple(edges, effort, np.ones(4), worst)
+        assert lower * (1 - 1e-7) <= least <= upper * (1 + 1e-7)  # the worst wrench takes it all
+
+
 def test_spatial_linf_against_support_directions_and_linear_programs():
     """No one of 10^5 directions is weaker than ``upper``, and linear programs agree with both bounds.
 
@@ -191,12 +185,15 @@ def test_spatial_linf_against_support_directions_and_linear_programs():
     position, normal, friction = ball(rng, 24, 4)
     edges, c = 32, np.cos(np.pi / 32)
     q, less = (
-        jg.epsilon_quality(jg.Grasp(position, normal, jg.HardFinger(share * friction)), "Linf")
+        jg.epsilon_quality(
+            jg.Grasp(position, normal, jg.HardFinger(share * friction)), "Linf", certificate=True
+        )
         for share in (1.0, c)
     )
     grasp = jg.Grasp(position, normal, jg.HardFinger(friction))
     resistant = np.flatnonzero(np.asarray(q.status) == Status.RESISTANT)
     assert len(resistant) >= 10
+    assert jg.check_certificate(grasp, q).all()
     assert_touching(grasp, q)
     A = np.asarray(effort_map(grasp, torque_lengths(grasp)))
     direction = rng.normal(size=(100_000, 6))
@@ -217,7 +214,7 @@ def test_spatial_linf_against_support_directions_and_linear_programs():
         v = np.einsum("kmn,m->kn", A[i], worst)
         assert resisted_multiple(inner, effort, np.ones(4), worst) <= upper * (1 + 1e-7)
         around = np.maximum(v[:, 0] + np.linalg.norm(v[:, 1:], axis=-1) / c, 0).sum()
-        assert resisted_multiple(outer, effort, np.ones(4), worst) <= around * (1 + 1e-7) <= 1.03 * upper
+        assert resisted_multiple(outer, effort, np.ones(4), worst) <= around * (1 + 1e-7)
 
 
 def test_nothing_depends_on_axes_order_or_units(grasp, answer):
@@ -232,34 +229,13 @@ def test_nothing_depends_on_axes_order_or_units(grasp, answer):
     permuted = jg.Grasp(position[:, order], normal[:, order], jg.HardFinger(friction[:, order]))
     larger = jg.Grasp(position * 1e3, normal * 7.0, part.model)
     for other in (turned, permuted, larger):
-        q = jg.epsilon_quality(other)
+        q = jg.epsilon_quality(other, certificate=True)  # the fixture's executable
         both = np.asarray(q.smooth) & np.asarray(answer.smooth)[chosen]
         assert both.sum() >= 8
         np.testing.assert_allclose(
             np.asarray(q.upper)[both], np.asarray(answer.upper)[chosen][both], rtol=1e-8
         )
         assert (np.asarray(q.lower) <= np.asarray(answer.upper)[chosen] * (1 + 1e-9)).all()
-
-
-def test_derivatives_against_differences(grasp, answer):
-    chosen = np.flatnonzero((np.asarray(answer.status) == Status.RESISTANT) & np.asarray(answer.smooth))[:8]
-    part = grasp[chosen]
-    x = (part.position, part.normal, part.model.friction_coefficient)
-
-    def answer_at(position, normal, friction):
-        return jg.epsilon_quality(jg.Grasp(position, normal, jg.HardFinger(friction)), torque_scale=1.0)
-
-    gradient = jax.grad(lambda *a: jnp.sum(answer_at(*a).upper), argnums=(0, 1, 2))(*x)
-    rng, h = np.random.default_rng(5), 1e-4
-    for w in range(3):
-        d = rng.normal(size=x[w].shape)
-        near = [answer_at(*[y + t * h * d if i == w else y for i, y in enumerate(x)]) for t in (-2, -1, 1, 2)]
-        a, b, c, e = (np.asarray(q.upper) for q in near)
-        difference = (8 * (c - b) - (e - a)) / (12 * h)
-        fine = np.all([np.asarray(q.smooth) for q in near], axis=0)
-        assert fine.sum() >= 5
-        slope = np.sum(np.asarray(gradient[w]) * d, axis=tuple(range(1, d.ndim)))
-        np.testing.assert_allclose(slope[fine], difference[fine], rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.slow

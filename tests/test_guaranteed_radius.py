@@ -52,7 +52,8 @@ def nearest_violation(grasp, out):
     return nearest
 
 
-def check(grasp, rng, attacks):
+def check_random_attacks(grasp, rng, attacks):
+    """The radius of each grasp, and which count, after random attacks just inside it."""
     out = jg.guaranteed_radius(grasp)
     status, radius, length = np.asarray(out.status), np.asarray(out.radius), np.asarray(out.length)
     counted = radius > 0
@@ -63,29 +64,40 @@ def check(grasp, rng, attacks):
         rub = rng.choice([-1.0, 1.0], size=shape[:2])
         now = jg.wrench_resistance(attacked(grasp, INSIDE * radius, length, move, turn, rub)).status
         assert (np.asarray(now)[counted] == status[counted]).all()
+    return out, counted
+
+
+def check(grasp, rng, attacks):
+    """Nor do attacks along the gradient, and the nearest that does is near: the radius is not vacuous."""
+    out, counted = check_random_attacks(grasp, rng, attacks)
     nearest = nearest_violation(grasp, out)[counted]
     assert (nearest > INSIDE).all()
     assert np.median(nearest) <= 10
     return nearest
 
 
-def test_no_attack_succeeds_and_the_nearest_one_is_near():
+def planar(rng, count):
+    """Three planar hard fingers."""
+    angle = rng.uniform(0, 2 * np.pi, (count, 3))
+    position = np.stack([np.cos(angle), np.sin(angle)], -1) * rng.uniform(0.3, 1, (count, 3, 1))
+    return jg.Grasp(position, -position + 0.3 * rng.normal(size=position.shape), jg.HardFinger(0.5))
+
+
+def test_no_random_attack_succeeds():
     rng = np.random.default_rng(0)
     position, normal, friction = ball(rng, 200, 4)
-    check(jg.Grasp(position, normal, jg.HardFinger(friction)), rng, attacks=10)
+    check_random_attacks(jg.Grasp(position, normal, jg.HardFinger(friction)), rng, attacks=10)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["hard 3", "hard 6", "soft", "planar"])
+@pytest.mark.parametrize("name", ["hard 3", "hard 4", "hard 6", "soft", "planar"])
 def test_a_hundred_thousand_attacks(name):
     """25 000 for each kind."""
     rng = np.random.default_rng(1)
     if name == "planar":
-        angle = rng.uniform(0, 2 * np.pi, (500, 3))
-        position = np.stack([np.cos(angle), np.sin(angle)], -1) * rng.uniform(0.3, 1, (500, 3, 1))
-        grasp = jg.Grasp(position, -position + 0.3 * rng.normal(size=position.shape), jg.HardFinger(0.5))
+        grasp = planar(rng, 500)
     else:
-        k = {"hard 3": 3, "hard 6": 6, "soft": 3}[name]
+        k = {"hard 3": 3, "hard 4": 4, "hard 6": 6, "soft": 3}[name]
         position, normal, friction = ball(rng, 500, k)
         model = jg.SoftFinger(friction, 0.2) if name == "soft" else jg.HardFinger(friction)
         grasp = jg.Grasp(position, normal, model)
@@ -94,11 +106,13 @@ def test_a_hundred_thousand_attacks(name):
 
 
 def test_nothing_is_guaranteed_where_the_verdict_rests_on_rank():
-    position = np.array([[-1.0, 0, 0], [1.0, 0, 0]])
-    out = jg.guaranteed_radius(jg.Grasp(position, -position, jg.HardFinger(0.5)))
+    """Two hard fingers, and two places left empty."""
+    position = np.array([[-1.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0]])
+    two = np.array([True, True, False, False])
+    out = jg.guaranteed_radius(jg.Grasp(position, -position, jg.HardFinger(0.5), two))
     assert int(out.status) == Status.NOT_RESISTANT
     assert float(out.radius) == 0
-    broken = jg.guaranteed_radius(jg.Grasp(position * np.nan, -position, jg.HardFinger(0.5)))
+    broken = jg.guaranteed_radius(jg.Grasp(position * np.nan, -position, jg.HardFinger(0.5), two))
     assert np.isnan(float(broken.radius))
 
 
@@ -107,24 +121,3 @@ def test_units_do_not_matter():
     one = jg.guaranteed_radius(jg.Grasp(position, normal, jg.HardFinger(friction)))
     other = jg.guaranteed_radius(jg.Grasp(1e-3 * position, 5 * normal, jg.HardFinger(friction)))
     np.testing.assert_allclose(other.radius, one.radius, rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_derivatives_of_resistant_grasps():
-    position, normal, friction = ball(np.random.default_rng(3), 24, 4)
-    status = np.asarray(jg.wrench_resistance(jg.Grasp(position, normal, jg.HardFinger(friction))).status)
-    keep = status == Status.RESISTANT
-    assert keep.sum() >= 8
-    x = (position[keep], normal[keep], friction[keep])
-
-    def radius(position, normal, friction):
-        return jg.guaranteed_radius(jg.Grasp(position, normal, jg.HardFinger(friction))).radius
-
-    gradient = jax.grad(lambda *a: jnp.sum(radius(*a)), argnums=(0, 1, 2))(*x)
-    d, h = np.random.default_rng(4).normal(size=x[2].shape), 1e-3
-    a, b, c, e = (np.asarray(radius(x[0], x[1], x[2] + t * h * d)) for t in (-2, -1, 1, 2))
-    difference = (8 * (c - b) - (e - a)) / (12 * h)
-    slope = np.sum(np.asarray(gradient[2]) * d, axis=-1)
-    # Kinks where another contact becomes the first to slip; the force is known to the root of the margin's gap.
-    close = np.abs(slope - difference) < 1e-3 * (np.abs(difference) + np.abs(difference).max())
-    assert close.mean() > 0.8

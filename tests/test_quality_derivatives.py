@@ -139,7 +139,7 @@ CASES = {
     "critical friction, soft": (critical, soft, OPEN),
     "radius, planar": (radius(RESISTANT), planar, CLOSED),
     "radius, hard": (radius(RESISTANT), hard, OPEN),
-    "radius, soft": (radius(RESISTANT), soft, OPEN),
+    "radius, soft": (radius(RESISTANT), lambda: apart(scattered(3, (0.2, 0.5))()), OPEN),
     "radius of a refuted grasp, planar": (radius(REFUTED), slippery(planar), CLOSED),
     "radius of a refuted grasp, hard": (radius(REFUTED), slippery(hard), OPEN),
     "radius of a refuted grasp, soft": (radius(REFUTED), slippery(soft), OPEN),
