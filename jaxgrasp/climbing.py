@@ -23,14 +23,14 @@ from jax import lax
 from ._types import Array
 from .contacts import ContactModel
 from .grasp import Grasp
+from .lanes import tile_width
 from .objectives import Objective
 from .requirements import Requirement, total_excess
 from .surfaces import SmoothSurface
+from .tangents import kept
 
 __all__ = ["Ended", "climb"]
 
-LANES = 64  # starts at once on a CPU: one tile of the solver
-ACCELERATOR_LANES = 16384
 ROUNDS = 8  # between two looks at the queue
 PENALTY = 1e2  # per squared radius of excess
 PATIENCE, IMPROVEMENT = 6, 1e-3  # rounds without that much improvement halve a start's steps
@@ -90,7 +90,7 @@ class _Ground(NamedTuple):
 
 def _kept(where: Array, new: Any, old: Any) -> Any:
     """``new`` in the lanes ``where``, ``old`` in the others."""
-    return jax.tree.map(lambda a, b: jnp.where(where.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)
+    return jax.tree.map(functools.partial(kept, where), new, old)
 
 
 def _ground(plan: _Plan, numbers: Any, surface: SmoothSurface, model: ContactModel) -> _Ground:
@@ -181,7 +181,7 @@ def climb(
     """
     numbers, asked = eqx.partition((objective, requirements), eqx.is_inexact_array_like)
     plan = _Plan(optimizer, asked)
-    width = LANES if jax.default_backend() == "cpu" else ACCELERATOR_LANES
+    width = tile_width(1)  # starts at once: one tile of the solver
     dtype = surface.centre.dtype
     limit = jnp.int32(steps)
     owner = np.full(width, -1)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from ._types import Array, Float
-from .geometry import wrench_dimension
+from .geometry import safe_root, wrench_dimension
 from .grasp import Grasp, folded_grasp_map, length_scale
 
 __all__ = [
@@ -74,8 +74,7 @@ def scaled(grasp: Grasp, force: Array) -> Float[Array, "*batch k n"]:
 def contact_support(A: Array, direction: Array) -> tuple[Array, Array, Array]:
     """``h_i(d)`` (k,), the unit force that attains it (k, n), and |v_t| (k,), for A (k, m, n) and d (m,)."""
     v = jnp.einsum("kmn,m->kn", A, direction)
-    square = jnp.sum(v[:, 1:] ** 2, axis=-1)
-    tail = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    tail = safe_root(jnp.sum(v[:, 1:] ** 2, axis=-1))
     unit = v[:, 1:] / jnp.where(tail > 0, tail, 1.0)[:, None]
     return v[:, 0] + tail, jnp.concatenate([jnp.ones_like(v[:, :1]), unit], axis=-1), tail
 
@@ -101,8 +100,7 @@ def support(A: Array, active: Array, norm: str, direction: Array) -> tuple[Array
 def signed_supports(A: Array, active: Array, norm: str, direction: Array) -> Float[Array, "*batch D"]:
     """``h`` of directions (*batch, D, m) for A (*batch, k, m, n); ``max_i h_i < 0`` where no contact pushes along d."""
     v = jnp.einsum("...kmn,...dm->...dkn", A, direction)
-    square = jnp.sum(v[..., 1:] ** 2, axis=-1)
-    h = v[..., 0] + jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    h = v[..., 0] + safe_root(jnp.sum(v[..., 1:] ** 2, axis=-1))
     h = jnp.where(active[..., None, :], h, -jnp.inf)
     most = jnp.max(h, axis=-1)
     if norm == "L1":

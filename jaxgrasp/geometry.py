@@ -20,6 +20,7 @@ __all__ = [
     "frame_components",
     "normalize",
     "normalize_components",
+    "safe_root",
     "skew",
     "wrench_dimension",
 ]
@@ -60,6 +61,12 @@ def cross_components(p: Components, f: Components) -> Components:
 def cross(p: Float[Array, "*batch d"], f: Float[Array, "*batch d"]) -> Float[Array, "*batch t"]:
     """``p x f``: a vector (t = 3) in space, the scalar ``p_x f_y - p_y f_x`` (t = 1) in the plane."""
     return jnp.stack(cross_components(components(p), components(f)), axis=-1)
+
+
+def safe_root(square: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """``sqrt(square)`` with derivative 0 where it is 0: a length from a sum of squares."""
+    there = square > 0
+    return jnp.where(there, jnp.sqrt(jnp.where(there, square, 1.0)), 0.0)
 
 
 def normalize_components(v: Components) -> Components:

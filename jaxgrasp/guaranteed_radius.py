@@ -29,7 +29,7 @@ from jax import lax
 
 from ._types import Array, Float, Int
 from .effort import effort_map, scaled
-from .geometry import normalize
+from .geometry import normalize, safe_root
 from .grasp import Grasp, length_scale
 from .resistance import wrench_resistance
 from .status import Status
@@ -69,8 +69,7 @@ class _Data(NamedTuple):
 
 
 def _norm(x: Array, axis: int = -1) -> Array:
-    square = jnp.sum(x * x, axis=axis)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    return safe_root(jnp.sum(x * x, axis=axis))
 
 
 def _spectral(matrix: Array) -> Array:

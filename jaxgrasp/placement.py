@@ -10,10 +10,11 @@ again there. Sources: the envelope theorem for the gradient; Zhu, Wang 2003 and 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import permutations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -133,7 +134,7 @@ class _Task(NamedTuple):
 
 def _starts(task: _Task, guide: Objective) -> tuple[np.ndarray, np.ndarray]:
     """Points (S, k, 3), each the best of a few random grasps by its guide, and their margins."""
-    points, margins = [], []
+    points, normals = [], []
     for group, first in enumerate(range(0, task.starts, GROUP)):
         # Every group is drawn whole: a start does not depend on how many there are.
         count = GROUP * task.candidates
@@ -145,32 +146,34 @@ def _starts(task: _Task, guide: Objective) -> tuple[np.ndarray, np.ndarray]:
         row = np.arange(min(GROUP, task.starts - first))
         chosen = row * task.candidates + value.argmax(axis=1)[row]
         points.append(point[chosen])
-        margins.append(np.maximum(np.asarray(wrench_resistance(grasp[chosen]).margin), FLOOR))
+        normals.append(normal[chosen])
         done = first + len(row)
         task.tell(PlacementProgress("screening", done, task.starts, float(value[row].max())))
-    return np.concatenate(points), np.concatenate(margins)
+    origin = np.concatenate(points)
+    verdict = wrench_resistance(task.about_centre(origin, np.concatenate(normals)))
+    return origin, np.maximum(np.asarray(verdict.margin), FLOOR)
 
 
 class _End(NamedTuple):
-    """Where starts ended: points (S, k, 3) on the smooth surface, (S,) values there, steps taken."""
+    """Where starts ended: points (S, k, 3) on the smooth surface, (S,) steps taken."""
 
     point: np.ndarray
-    value: np.ndarray
     steps: np.ndarray
 
 
 def _climbed(
     task: _Task, objective: Objective, optimizer: optax.GradientTransformation, origin: np.ndarray, steps: int
 ) -> _End:
-    end = _End(origin.copy(), np.full(len(origin), -np.inf), np.zeros(len(origin), int))
-    done, phase = 0, type(objective).__name__.lower()
+    end = _End(origin.copy(), np.zeros(len(origin), int))
+    done, best, phase = 0, -np.inf, type(objective).__name__.lower()
     for ended in climb(
         task.surface.traced, task.model, objective, optimizer, task.requirements, origin, steps
     ):
         for one in ended:
-            end.point[one.start], end.value[one.start], end.steps[one.start] = one.point, one.value, one.steps
+            end.point[one.start], end.steps[one.start] = one.point, one.steps
+            best = max(best, one.value)
         done += len(ended)
-        task.tell(PlacementProgress(phase, done, task.starts, float(end.value.max())))
+        task.tell(PlacementProgress(phase, done, task.starts, best))
     return end
 
 
@@ -251,14 +254,19 @@ def place_contacts(
 
 
 class _Exact(NamedTuple):
-    """Contacts on the exact surface, and what they are worth there."""
+    """Contacts of S starts on the exact surface, and what they are worth there."""
 
     position: np.ndarray
     normal: np.ndarray
-    margin: np.ndarray
-    resistant: np.ndarray
+    verdict: WrenchResistance
+    proved: np.ndarray
     excess: np.ndarray
     value: np.ndarray  # rough
+
+    @property
+    def resistant(self) -> np.ndarray:
+        """Wrench resistant, with a certificate the checker accepts."""
+        return (np.asarray(self.verdict.status) == Status.RESISTANT) & self.proved
 
 
 @jax.jit
@@ -270,23 +278,20 @@ def _exact(task: _Task, objective: Objective, point: np.ndarray) -> _Exact:
     position, normal = task.surface.exact_contact(point)
     grasp = task.about_centre(position, normal)
     verdict = wrench_resistance(grasp)
-    resistant = (np.asarray(verdict.status) == Status.RESISTANT) & check_certificate(grasp, verdict)
     there = jnp.asarray(position), jnp.asarray(normal)
     excess = np.asarray(total_excess(task.requirements, task.surface.traced, *there))
-    margin = np.asarray(verdict.margin)
     if isinstance(objective, Margin):
-        return _Exact(position, normal, margin, resistant, excess, margin)
-    parts = [position[i : i + GROUP] for i in range(0, len(position), GROUP)]
-    turned = [normal[i : i + GROUP] for i in range(0, len(position), GROUP)]
-    value = [
-        _rough(objective, task.about_centre(_full(p), _full(n))) for p, n in zip(parts, turned, strict=True)
-    ]
-    return _Exact(position, normal, margin, resistant, excess, np.concatenate(value)[: len(position)])
+        value = np.asarray(verdict.margin)
+    else:  # in groups of one size, so that one program serves all
+        count = len(position)
+        rows = np.minimum(np.arange(-(-count // GROUP) * GROUP), count - 1).reshape(-1, GROUP)
+        value = np.concatenate([_rough(objective, grasp[group]) for group in rows])[:count]
+    return _Exact(position, normal, verdict, check_certificate(grasp, verdict), excess, value)
 
 
-def _full(x: np.ndarray) -> np.ndarray:
-    """A group of one size, so that one program serves all."""
-    return np.concatenate([x, np.repeat(x[:1], GROUP - len(x), axis=0)])
+def _either(where: np.ndarray, a: Any, b: Any) -> np.ndarray:
+    """Rows of ``a`` where ``where`` (S,), of ``b`` elsewhere."""
+    return np.where(where.reshape(-1, *[1] * (a.ndim - 1)), a, b)
 
 
 def _judged(
@@ -310,20 +315,19 @@ def _judged(
     for earlier in (*(end.point for end in ends[:-1]), origin):
         other = _exact(task, objective, earlier)
         better = worth(other) > worth(exact)
-        pairs = zip(other, exact, strict=True)
-        exact = _Exact(*(np.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs))
-    value = exact.value
-    order = np.flatnonzero(np.isfinite(value) & (exact.excess <= limit))
-    order = order[np.lexsort((-value[order], ~exact.resistant[order]))]
+        exact = jax.tree.map(functools.partial(_either, better), other, exact)
+    order = np.flatnonzero(np.isfinite(exact.value) & (exact.excess <= limit))
+    order = order[np.lexsort((-exact.value[order], ~exact.resistant[order]))]
     chosen = np.array(_distinct(exact.position, order, best, distinct * float(task.surface.radius)), int)
-    grasp = task.about_centre(exact.position[chosen], exact.normal[chosen])
-    final = np.asarray(objective.final(grasp)) if len(chosen) else np.zeros(0)
+    final = np.zeros(0)
+    if len(chosen):
+        final = np.asarray(objective.final(task.about_centre(exact.position[chosen], exact.normal[chosen])))
     again = np.lexsort((-final, np.isnan(final)))
     chosen, final = chosen[again], final[again]
-    grasp = grasp[again]
-    verdict = wrench_resistance(grasp)
+    verdict = jax.tree.map(lambda x: jnp.asarray(x[chosen]), exact.verdict)
+    position, normal = exact.position[chosen], exact.normal[chosen]
     steps = np.sum([end.steps for end in ends], axis=0)
     return Placement(
-        grasp, exact.position[chosen], final, chosen, verdict, check_certificate(grasp, verdict),
-        before, exact.margin, exact.resistant, origin, exact.position, steps, exact.excess,
+        task.about_centre(position, normal), position, final, chosen, verdict, exact.proved[chosen], before,
+        np.asarray(exact.verdict.margin), exact.resistant, origin, exact.position, steps, exact.excess,
     )  # fmt: skip

@@ -14,6 +14,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ._types import Array, Float
+from .geometry import safe_root
 from .surfaces import SmoothSurface
 
 __all__ = ["SLACK", "Apart", "Beyond", "EdgeClearance", "JawWidth", "Requirement", "Within", "total_excess"]
@@ -29,14 +30,9 @@ class Requirement(eqx.Module):
         """``sqrt(sum of squared violations)`` in m; 0 where satisfied."""
 
 
-def _root(squares: Array) -> Array:
-    there = squares > 0
-    return jnp.where(there, jnp.sqrt(jnp.where(there, squares, 1.0)), 0.0)
-
-
 def _short(x: Array) -> Array:
     """(sum of max(x, 0)^2)^(1/2) over the last axis."""
-    return _root(jnp.sum(jnp.maximum(x, 0.0) ** 2, axis=-1))
+    return safe_root(jnp.sum(jnp.maximum(x, 0.0) ** 2, axis=-1))
 
 
 def _pairs(position: Array) -> list[tuple[int, int]]:
@@ -45,7 +41,7 @@ def _pairs(position: Array) -> list[tuple[int, int]]:
 
 def _distances(position: Array) -> Array:
     apart = [position[..., a, :] - position[..., b, :] for a, b in _pairs(position)]
-    return jnp.stack([_root(jnp.sum(d * d, axis=-1)) for d in apart], axis=-1)
+    return jnp.stack([safe_root(jnp.sum(d * d, axis=-1)) for d in apart], axis=-1)
 
 
 def total_excess(
@@ -55,7 +51,7 @@ def total_excess(
     total = jnp.zeros(position.shape[:-2], position.dtype)
     for requirement in requirements:
         total = total + requirement.excess(surface, position, normal) ** 2
-    return _root(total)
+    return safe_root(total)
 
 
 class Apart(Requirement):
@@ -110,4 +106,4 @@ class Beyond(Requirement):
 
     def excess(self, surface: SmoothSurface, position: Array, normal: Array) -> Float[Array, "*batch"]:
         away = position - jnp.asarray(self.centre, position.dtype)
-        return _short(self.radius - _root(jnp.sum(away * away, axis=-1)))
+        return _short(self.radius - safe_root(jnp.sum(away * away, axis=-1)))
