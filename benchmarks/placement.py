@@ -1,6 +1,6 @@
 """Contact placement on one core: what it costs, and what it finds beside random sampling and Nelder-Mead.
 
-    python benchmarks/placement.py [--json FILE] [--starts 128] [--simplexes 8] [--objects mug bowl part.stl:mm]
+    python benchmarks/placement.py [--json FILE] [--starts 128] [--simplexes 32] [--objects mug bowl part.stl:mm]
                                    [--fingers 3 4 2] [--no-table]
 
 Costs: starts and steps per second on the mug; value, gradient and quality measures per grasp; the epsilon bracket
@@ -9,7 +9,8 @@ beside Qhull's hull of 32-edge pyramids. Table: every object, three and four har
 
     random m   the random grasp of largest margin among as many as fit in the same time
     random e   half that time for margins, half for epsilon of those with the largest margins: the largest epsilon
-    simplex    SciPy's Nelder-Mead (adaptive) from the first starts, as many evaluations as placement takes steps
+    simplex    SciPy's Nelder-Mead (adaptive) from the first starts, on the triangles, as many evaluations of epsilon
+               as placement takes steps and trials
 
 Contacts of all are judged alike: on the mesh's own triangles, epsilon to 1 %. Objects are built-in names, mesh files
 (FILE or FILE:UNIT), and, where JAXGRASP_DATA or ../shared/data has them, twelve real meshes. One process pinned to one
@@ -20,6 +21,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import threading
 import time
 from pathlib import Path
 
@@ -29,6 +31,7 @@ from wrench_resistance import hardware  # also pins the process and sets it to o
 
 # isort: split
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -43,7 +46,8 @@ from jaxgrasp.contacts import ContactModel
 from jaxgrasp.effort import effort_map, torque_lengths
 from jaxgrasp.objectives import Epsilon, Margin
 from jaxgrasp.placement import CANDIDATES, Placement, place_contacts
-from jaxgrasp.surfaces import MeshSurface, SmoothSurface
+from jaxgrasp.settling import ROUNDS, TRIALS
+from jaxgrasp.surfaces import MeshSurface
 
 REAL = (
     "ycb/005_tomato_soup_can.obj.gz", "ycb/009_gelatin_box.obj.gz", "ycb/011_banana.obj.gz",
@@ -132,33 +136,43 @@ def random_sampling(problem: Problem, starts: int, seconds: float) -> tuple[np.n
 
 
 @jax.jit
-def _single(surface: SmoothSurface, model: ContactModel, point: jax.Array) -> jax.Array:
-    """Epsilon of one grasp where it holds, its margin (at most 0) where it does not: what the simplex climbs."""
-    position, normal = surface.contact(point)
-    grasp = jg.Grasp(position - surface.centre, normal, model)
-    epsilon = jg.epsilon_quality(grasp, torque_scale=surface.radius, tolerance=0.1).upper
+def _each(grasp: jg.Grasp, scale: jax.Array) -> jax.Array:
+    """Epsilon of grasps that hold, the margin (at most 0) of others: what simplexes climb."""
+    epsilon = jg.epsilon_quality(grasp, torque_scale=scale, tolerance=0.1).upper
     margin = jnp.maximum(jg.wrench_resistance(grasp).margin, -10.0)
     return jnp.where(epsilon > 0, epsilon, jnp.minimum(margin, 0.0))
 
 
 def simplex(problem: Problem, origin: np.ndarray, evaluations: int) -> np.ndarray:
-    """Where Nelder-Mead ends from each of ``origin``; coordinates in units of the radius, first moves of 5 % of it."""
-    radius, shape = problem.radius, origin.shape[1:]
+    """Where Nelder-Mead ends from each of ``origin``; coordinates in units of the radius, first moves of 5 % of it.
 
-    def cost(x: np.ndarray) -> float:
-        value = _single(problem.surface.traced, problem.model, jnp.asarray(radius * x.reshape(shape)))
-        return -float(value) if np.isfinite(value) else 10.0
+    All simplexes wait for each other at every evaluation: a batch costs little more than one grasp.
+    """
+    radius, shape, count = problem.radius, origin.shape[1:], len(origin)
+    asked, answers = np.array(origin), np.zeros(count)
 
-    ends = []
-    for point in origin:
-        x = point.ravel() / radius
-        first = np.concatenate([x[None], x + 0.05 * np.eye(x.size)])
-        found = minimize(
-            cost, x, method="Nelder-Mead",
-            options={"initial_simplex": first, "maxfev": evaluations, "adaptive": True, "xatol": 0, "fatol": 0},
-        )  # fmt: skip
-        ends.append(radius * found.x.reshape(shape))
-    return np.array(ends)
+    def answer() -> None:
+        values = np.asarray(_each(problem.grasp(*problem.surface.exact_contact(asked)), jnp.asarray(radius)))
+        answers[:] = np.where(np.isfinite(values), -values, 10.0)
+
+    together = threading.Barrier(count, answer)
+
+    def run(i: int) -> np.ndarray:
+        def cost(x: np.ndarray) -> float:
+            asked[i] = radius * x.reshape(shape)
+            together.wait()
+            return float(answers[i])
+
+        x = origin[i].ravel() / radius
+        options = {"maxfev": evaluations, "adaptive": True, "xatol": 0, "fatol": 0}
+        options["initial_simplex"] = np.concatenate([x[None], x + 0.05 * np.eye(x.size)])
+        found = minimize(cost, x, method="Nelder-Mead", options=options)
+        for _ in range(found.nfev, evaluations):  # one that shrank to nothing lets the others go on
+            together.wait()
+        return radius * found.x.reshape(shape)
+
+    with ThreadPoolExecutor(count) as pool:
+        return np.array(list(pool.map(run, range(count))))
 
 
 def row(name: str, problem: Problem, starts: int, simplexes: int) -> dict[str, Any]:
@@ -176,7 +190,7 @@ def row(name: str, problem: Problem, starts: int, simplexes: int) -> dict[str, A
     ends = {
         "random": problem.random(3, starts)[0], "start": out.origin, "placed": out.end,
         "random m": by_margin, "random e": by_epsilon,
-        "simplex": simplex(problem, out.origin[:simplexes], steps),
+        "simplex": simplex(problem, out.origin[:simplexes], steps + ROUNDS * TRIALS),
     }  # fmt: skip
     figures: dict[str, Any] = {
         "object": Path(name.partition(":")[0]).name.partition(".")[0],
@@ -291,7 +305,7 @@ def main() -> None:
     )
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     parser.add_argument("--starts", type=int, default=128)
-    parser.add_argument("--simplexes", type=int, default=8, help="starts that Nelder-Mead has")
+    parser.add_argument("--simplexes", type=int, default=32, help="starts that Nelder-Mead has")
     parser.add_argument("--objects", nargs="+", help="built-in names and mesh files, FILE or FILE:UNIT")
     parser.add_argument("--fingers", type=int, nargs="+", default=[3, 4, 2], choices=[2, 3, 4])
     parser.add_argument("--no-table", action="store_true", help="costs alone")

@@ -24,14 +24,14 @@ from ._types import Array
 from .contacts import ContactModel
 from .grasp import Grasp
 from .lanes import tile_width
-from .objectives import Objective
+from .objectives import Objective, look
 from .requirements import Requirement, total_excess
 from .surfaces import SmoothSurface
 from .tangents import kept
 
 __all__ = ["Ended", "climb"]
 
-ROUNDS = 8  # between two looks at the queue
+ROUNDS = 8  # between two looks at the queue, where there is nothing to learn between them
 PENALTY = 1e2  # per squared radius of excess
 PATIENCE, IMPROVEMENT = 6, 1e-3  # rounds without that much improvement halve a start's steps
 SMALLEST = 2.0**-5  # of the optimiser's own steps: a start that would take smaller ones ends
@@ -112,11 +112,12 @@ def _begin(plan: _Plan, numbers: Any, surface: SmoothSurface, model: ContactMode
 def _advance(
     plan: _Plan, numbers: Any, surface: SmoothSurface, model: ContactModel, lanes: _Lanes, limit: Array
 ) -> _Lanes:
-    """A few rounds, fewer where all lanes have ended."""
+    """A few rounds, fewer where all lanes have ended; one of an objective that learns after each."""
     ground = _ground(plan, numbers, surface, model)
+    rounds = ROUNDS if ground.objective.interval == 1 else 1
 
     def unfinished(carry: tuple[Array, _Lanes]) -> Array:
-        return (carry[0] < ROUNDS) & jnp.any(carry[1].alive)
+        return (carry[0] < rounds) & jnp.any(carry[1].alive)
 
     def one(carry: tuple[Array, _Lanes]) -> tuple[Array, _Lanes]:
         return carry[0] + 1, _round(plan.optimizer, ground, carry[1], limit)
@@ -124,11 +125,15 @@ def _advance(
     return lax.while_loop(unfinished, one, (jnp.int32(0), lanes))[1]
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def _grasp(plan: _Plan, numbers: Any, surface: SmoothSurface, model: ContactModel, point: Array) -> Grasp:
+    return _ground(plan, numbers, surface, model).grasp(point)[0]
+
+
 def _round(optimizer: optax.GradientTransformation, ground: _Ground, lanes: _Lanes, limit: Array) -> _Lanes:
     objective, surface = ground.objective, ground.surface
     memory, best = lanes.memory, lanes.best
     if objective.interval > 1:
-        memory = objective.learn(ground.grasp(lanes.point)[0], memory)
         again = ground.scores(lanes.best_point, memory)[1]  # what is known now may bound the best point, too
         best = jnp.where(again < best, again, best)
     (_, scores), slope = jax.value_and_grad(ground.scores, has_aux=True)(lanes.point, memory)
@@ -158,7 +163,7 @@ def _round(optimizer: optax.GradientTransformation, ground: _Ground, lanes: _Lan
     if objective.interval > 1:
         carry = lax.fori_loop(1, objective.interval, again_uphill, carry)
     point = _kept(stuck, best_point, carry[0])
-    moved = lanes._replace(point=point, optimizer=carry[1], memory=memory)
+    moved = lanes._replace(point=point, optimizer=carry[1])
     return _kept(alive, moved, lanes)._replace(
         best=best, best_point=best_point, waited=jnp.where(stuck, 0, waited), scale=scale,
         steps=lanes.steps + jnp.where(alive, objective.interval, 0).astype(jnp.int32), alive=alive,
@@ -198,6 +203,9 @@ def climb(
             fresh = fresh._replace(alive=jnp.asarray(owner >= 0))
             entered = np.isin(np.arange(width), free)
             lanes = fresh if lanes is None else _entered(jnp.asarray(entered), fresh, lanes)
+        if objective.interval > 1:
+            grasp = _grasp(plan, numbers, surface, model, lanes.point)
+            lanes = lanes._replace(memory=look(objective, grasp, lanes.memory))
         lanes = _advance(plan, numbers, surface, model, lanes, limit)
         over = np.flatnonzero((owner >= 0) & ~np.asarray(lanes.alive))
         if len(over):

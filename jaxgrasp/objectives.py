@@ -26,9 +26,19 @@ from .geometry import wrench_dimension
 from .grasp import Grasp
 from .resistance import wrench_resistance
 
-__all__ = ["FLOOR", "Epsilon", "EpsilonFloor", "Margin", "Measure", "Objective", "objective"]
+__all__ = [
+    "FLOOR",
+    "Epsilon",
+    "EpsilonFloor",
+    "Margin",
+    "Measure",
+    "Objective",
+    "lessons",
+    "look",
+    "objective",
+]
 
-LESSONS = 4  # of a memory, for a rough value
+LESSONS = 4
 FLOOR = -10.0  # margins below it (and -inf) count as it
 
 
@@ -58,16 +68,28 @@ class Objective(eqx.Module):
     def value(self, grasp: Grasp, memory: Any) -> Float[Array, " B"]:
         """What is climbed, as far as the memory knows."""
 
-    def rough(self, grasp: Grasp) -> Float[Array, " B"]:
-        """The values of grasps not seen before, after a few lessons: good enough to choose between them."""
-        memory = self.begin(grasp)
-        if self.interval > 1:
-            memory = lax.fori_loop(0, LESSONS, lambda _, m: self.learn(grasp, m), memory)
-        return self.value(grasp, memory)
-
     def final(self, grasp: Grasp) -> Float[Array, " B"]:
         """The values to report."""
         return self.value(grasp, self.begin(grasp))
+
+
+def look(objective: Objective, grasp: Grasp, memory: Any) -> Any:
+    """``objective.learn``: compiled once for all who learn about as many grasps at a time."""
+    numbers, asked = eqx.partition(objective, eqx.is_inexact_array_like)
+    return _look(asked, numbers, grasp, memory)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _look(asked: Objective, numbers: Any, grasp: Grasp, memory: Any) -> Any:
+    return eqx.combine(numbers, asked).learn(grasp, memory)
+
+
+def lessons(objective: Objective, grasp: Grasp) -> Any:
+    """The memory of grasps not seen before, after looks enough to choose between them by their ``value``."""
+    memory = objective.begin(grasp)
+    for _ in range(LESSONS if objective.interval > 1 else 0):
+        memory = look(objective, grasp, memory)
+    return memory
 
 
 class Margin(Objective):
@@ -125,11 +147,7 @@ class _Bank(NamedTuple):
 
 
 BANK = 24  # directions of a grasp
-RAYS, WARM, SHOTS = (
-    4,
-    2,
-    2,
-)  # learnt at once: from the weakest two of the bank and two new ones, by two ray shots each
+RAYS, WARM, SHOTS = 4, 2, 2  # learnt at once: two of the bank's weakest and two new ones, two ray shots each
 SOFTNESS = 0.03  # of the smallest h: directions so much stronger count e times less
 ROWS = 1024  # of the table that new directions come from
 
@@ -181,22 +199,30 @@ class Epsilon(Objective):
         return _Bank(memory.direction.at[lane, turn % BANK].set(rays), memory.seen + RAYS)
 
     def _supports(self, grasp: Grasp, memory: _Bank) -> Array:
-        A = effort_map(grasp, torque_lengths(grasp, self.torque_scale))
-        h = signed_supports(A, grasp.active, self.norm, memory.direction)
-        return jnp.where(jnp.arange(BANK, dtype=jnp.int32) < memory.seen[:, None], h, jnp.inf)
+        return _supports(grasp, self.norm, torque_lengths(grasp, self.torque_scale), memory)
 
     def value(self, grasp: Grasp, memory: _Bank) -> Float[Array, " B"]:
-        h = self._supports(grasp, memory)
-        least = jnp.min(h, axis=-1, keepdims=True)
-        # The derivative is a weighted mean of those of the weakest directions: ridges would make the climb zigzag.
-        width = jnp.maximum(SOFTNESS * jnp.abs(least), jnp.finfo(h.dtype).tiny ** 0.5)
-        weight = jnp.exp((least - h) / width)
-        weight = lax.stop_gradient(weight / jnp.sum(weight, axis=-1, keepdims=True))
-        mean = jnp.sum(jnp.where(weight > 0, weight * jnp.where(weight > 0, h, 0.0), 0.0), axis=-1)
-        return lax.stop_gradient(least[..., 0] - mean) + mean
+        return _smallest(self._supports(grasp, memory))
 
     def final(self, grasp: Grasp) -> Float[Array, " B"]:
         return epsilon_quality(grasp, self.norm, self.torque_scale).upper
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _supports(grasp: Grasp, norm: str, length: Array, memory: _Bank) -> Array:
+    h = signed_supports(effort_map(grasp, length), grasp.active, norm, memory.direction)
+    return jnp.where(jnp.arange(BANK, dtype=jnp.int32) < memory.seen[:, None], h, jnp.inf)
+
+
+@jax.jit
+def _smallest(h: Array) -> Array:
+    """min h; its derivative a weighted mean of those of the weakest directions: ridges would make the climb zigzag."""
+    least = jnp.min(h, axis=-1, keepdims=True)
+    width = jnp.maximum(SOFTNESS * jnp.abs(least), jnp.finfo(h.dtype).tiny ** 0.5)
+    weight = jnp.exp((least - h) / width)
+    weight = lax.stop_gradient(weight / jnp.sum(weight, axis=-1, keepdims=True))
+    mean = jnp.sum(jnp.where(weight > 0, weight * jnp.where(weight > 0, h, 0.0), 0.0), axis=-1)
+    return lax.stop_gradient(least[..., 0] - mean) + mean
 
 
 def objective(given: Any) -> Objective:

@@ -3,9 +3,10 @@
     maximise  q(G(x(p)))  -  weight * sum of squared excesses,     x(p) the projection of p onto the surface
 
 q is any differentiable function of a ``Grasp``: the margin by default. A start is the best of many random grasps,
-which cost little to screen; its contacts climb the guide of q (the margin, for most), and from there q itself. At the
-end contacts are put exactly onto a mesh's triangles, with the faces' own normals, and every grasp is solved and proved
-again there. Sources: the envelope theorem for the gradient; Zhu, Wang 2003 and Liu et al. 2021 (grasps by gradients).
+which cost little to screen; its contacts climb the guide of q (the margin, for most), and from there q itself. On a
+mesh they are then put exactly onto the triangles, with the faces' own normals, and settle there by short random moves;
+every grasp is solved and proved again. Sources: the envelope theorem for the gradient; Zhu, Wang 2003 and Liu et al.
+2021 (grasps by gradients).
 """
 
 from __future__ import annotations
@@ -27,10 +28,11 @@ from .climbing import climb
 from .contacts import ContactModel, HardFinger
 from .errors import UserError
 from .grasp import Grasp
-from .objectives import FLOOR, Margin, Objective
+from .objectives import FLOOR, Margin, Objective, lessons
 from .objectives import objective as as_objective
 from .requirements import SLACK, Requirement, total_excess
 from .resistance import WrenchResistance, wrench_resistance
+from .settling import ROUNDS, settle
 from .status import Status
 from .surfaces import Surface
 
@@ -125,6 +127,7 @@ class _Task(NamedTuple):
     requirements: tuple[Requirement, ...]
     starts: int
     candidates: int
+    settling: int
     seed: int
     tell: Callable[[PlacementProgress], None]
 
@@ -204,6 +207,7 @@ def place_contacts(
     optimizer: optax.GradientTransformation | None = None,
     requirements: Sequence[Requirement] = (),
     candidates: int = CANDIDATES,
+    settling: int = ROUNDS,
     best: int = 16,
     distinct: float = 0.1,
     seed: int = 0,
@@ -223,6 +227,7 @@ def place_contacts(
     optimizer     an optax optimiser over contacts (k, 3) in units of the surface's radius, a state for each start; by
                   default ``optax.adam(0.05)``. Its steps are halved where a start no longer improves
     requirements  ``Apart``, ``Within``, ``Beyond``, ``EdgeClearance``, ``JawWidth`` or your own ``Requirement``
+    settling      rounds of random moves on a mesh's own triangles at the end, 16 trials of the objective each; 0: none
     best          grasps to return at most, each ``distinct`` (of the radius) away from every better one
     seed          the same seed gives the same grasps
     progress      called with a ``PlacementProgress`` as starts end
@@ -238,13 +243,15 @@ def place_contacts(
     for name, value in counts.items():
         if not isinstance(value, int | np.integer) or value < 1:
             raise ValueError(f"{name} must be an integer of 1 or more, got {value!r}")
+    if not isinstance(settling, int | np.integer) or settling < 0:
+        raise ValueError(f"settling must be an integer of 0 or more, got {settling!r}")
     if not all(isinstance(r, Requirement) for r in requirements):
         raise ValueError("requirements must be jaxgrasp.requirements such as Apart(0.02)")
     asked = Margin() if objective is None else as_objective(objective)
     optimizer = ADAM if optimizer is None else optimizer
     model = HardFinger(0.5) if model is None else model
     tell = progress if progress is not None else lambda _: None
-    task = _Task(surface, fingers, model, tuple(requirements), starts, candidates, seed, tell)
+    task = _Task(surface, fingers, model, tuple(requirements), starts, candidates, settling, seed, tell)
     guide = asked.guide()
     origin, before = _starts(task, guide)
     ends = [_climbed(task, guide, optimizer, origin, steps)]
@@ -261,21 +268,20 @@ class _Exact(NamedTuple):
     verdict: WrenchResistance
     proved: np.ndarray
     excess: np.ndarray
-    value: np.ndarray  # rough
+    value: np.ndarray  # good enough to choose by
 
     @property
     def resistant(self) -> np.ndarray:
         """Wrench resistant, with a certificate the checker accepts."""
         return (np.asarray(self.verdict.status) == Status.RESISTANT) & self.proved
 
+    def worth(self, limit: float) -> np.ndarray:
+        """The value where the grasp is resistant and within ``limit`` of the requirements, elsewhere -inf."""
+        held = self.resistant & (self.excess <= limit) & np.isfinite(self.value)
+        return np.where(held, self.value, -np.inf)
 
-@jax.jit
-def _rough(objective: Objective, grasp: Grasp) -> Array:
-    return objective.rough(grasp)
 
-
-def _exact(task: _Task, objective: Objective, point: np.ndarray) -> _Exact:
-    position, normal = task.surface.exact_contact(point)
+def _exact(task: _Task, objective: Objective, position: np.ndarray, normal: np.ndarray) -> _Exact:
     grasp = task.about_centre(position, normal)
     verdict = wrench_resistance(grasp)
     there = jnp.asarray(position), jnp.asarray(normal)
@@ -285,8 +291,21 @@ def _exact(task: _Task, objective: Objective, point: np.ndarray) -> _Exact:
     else:  # in groups of one size, so that one program serves all
         count = len(position)
         rows = np.minimum(np.arange(-(-count // GROUP) * GROUP), count - 1).reshape(-1, GROUP)
-        value = np.concatenate([_rough(objective, grasp[group]) for group in rows])[:count]
+        some = [grasp[group] for group in rows]
+        value = np.concatenate([objective.value(g, lessons(objective, g)) for g in some])[:count]
     return _Exact(position, normal, verdict, check_certificate(grasp, verdict), excess, value)
+
+
+def _settled(task: _Task, objective: Objective, exact: _Exact) -> _Exact:
+    """Contacts after a while of random moves."""
+    position, normal, done, best = exact.position.copy(), exact.normal.copy(), 0, -np.inf
+    for group in settle(
+        task.surface, task.model, objective, task.requirements, position, normal, task.seed, task.settling
+    ):
+        position[group.start], normal[group.start] = group.position, group.normal
+        done, best = done + len(group.start), max(best, group.best)
+        task.tell(PlacementProgress("settling", done, task.starts, best))
+    return _exact(task, objective, position, normal)
 
 
 def _either(where: np.ndarray, a: Any, b: Any) -> np.ndarray:
@@ -306,16 +325,16 @@ def _judged(
     """Exact contacts, verdicts and proofs of all starts; the best distinct ones among those within the requirements."""
     limit = SLACK * float(task.surface.radius)
 
-    def worth(x: _Exact) -> np.ndarray:
-        held = x.resistant & (x.excess <= limit)
-        return np.where(held & np.isfinite(x.value), x.value, -np.inf)
+    def better(one: _Exact, other: _Exact) -> _Exact:
+        won = one.worth(limit) > other.worth(limit)
+        return jax.tree.map(functools.partial(_either, won), one, other)
 
     # The exact surface is not quite the smooth one: a climb may lose there what it won, and its start be better.
-    exact = _exact(task, objective, ends[-1].point)
+    exact = _exact(task, objective, *task.surface.exact_contact(ends[-1].point))
     for earlier in (*(end.point for end in ends[:-1]), origin):
-        other = _exact(task, objective, earlier)
-        better = worth(other) > worth(exact)
-        exact = jax.tree.map(functools.partial(_either, better), other, exact)
+        exact = better(_exact(task, objective, *task.surface.exact_contact(earlier)), exact)
+    if task.settling and task.surface.faceted:
+        exact = better(_settled(task, objective, exact), exact)
     order = np.flatnonzero(np.isfinite(exact.value) & (exact.excess <= limit))
     order = order[np.lexsort((-exact.value[order], ~exact.resistant[order]))]
     chosen = np.array(_distinct(exact.position, order, best, distinct * float(task.surface.radius)), int)

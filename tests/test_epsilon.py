@@ -154,7 +154,7 @@ def test_linf_ball_is_resisted_and_no_larger_one():
     position = np.stack([np.cos(angle), np.sin(angle)], -1)
     normal = -position + 0.3 * rng.normal(size=position.shape)
     grasp = jg.Grasp(position, normal, jg.HardFinger(0.4))
-    q = jg.epsilon_quality(grasp, "Linf", certificate=True)
+    q = jg.epsilon_quality(grasp, "Linf", tolerance=1e-6, certificate=True)
     assert jg.check_certificate(grasp, q).all()
     assert_touching(grasp, q)
     resistant = np.flatnonzero(np.asarray(q.status) == Status.RESISTANT)

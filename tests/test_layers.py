@@ -100,6 +100,7 @@ FLOORS = [
     "requirements",
     "objectives",
     "climbing",
+    "settling",
     "placement",
     "candidates",
     "formats",

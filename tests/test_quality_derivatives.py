@@ -74,8 +74,10 @@ def with_task(problem):
 
 
 def epsilon(norm):
+    """The upper bound, closely enough that it rarely jumps from one weak direction to another a percent weaker."""
+
     def measure(x):
-        q = jg.epsilon_quality(grasp_of(x), norm, torque_scale=1.0)
+        q = jg.epsilon_quality(grasp_of(x), norm, torque_scale=1.0, tolerance=1e-3)
         return q.upper, q.smooth
 
     return measure

@@ -8,7 +8,7 @@ point's by curvature times the square of the distance. Outside: ``project_exact`
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -118,6 +118,7 @@ class MeshSurface(Surface):
     resolution cannot resolve; ValueError for wrong arguments.
     """
 
+    faceted: ClassVar[bool] = True
     smooth: GridSurface
     triangles: Triangles = eqx.field(static=True)
     search: TriangleSearch = eqx.field(static=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import abc
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -196,7 +196,12 @@ class SmoothSurface(eqx.Module):
 
 
 class Surface(SmoothSurface):
-    """A ``SmoothSurface`` of which the host knows more: random points, and where contacts really are."""
+    """A ``SmoothSurface`` of which the host knows more: random points, and where contacts really are.
+
+    faceted  whether the real surface is another one than the smooth one, with jumping normals
+    """
+
+    faceted: ClassVar[bool] = False
 
     @abc.abstractmethod
     def sample(self, seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
