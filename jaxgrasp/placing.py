@@ -54,6 +54,7 @@ PHASES = {
     "margin": "climbing the margin",
     "epsilonfloor": "climbing a bound of epsilon",
     "epsilon": "climbing epsilon",
+    "settling": "settling on the mesh",
 }
 
 
