@@ -20,13 +20,13 @@ import numpy as np
 from ._types import Array
 from .contacts import ContactModel
 from .grasp import Grasp
-from .lanes import tile_width
 from .objectives import Objective, lessons, look
 from .requirements import SLACK, Requirement, total_excess
 from .surfaces import SmoothSurface, Surface
 
 __all__ = ["ROUNDS", "TRIALS", "Settled", "settle"]
 
+GROUP = 64  # starts at a time
 ROUNDS = 32
 TRIALS = 16  # a round
 CLOUD = 1 << 15  # points that contacts may move to: neighbours are 1 to 2 % of the radius apart
@@ -114,10 +114,10 @@ def settle(
     seed and its own number alone.
     """
     task = _Task(surface.traced, model, objective, requirements)
-    cloud, width = _Cloud(surface), tile_width(1)
-    for group, first in enumerate(range(0, len(position), width)):
-        start = np.arange(first, min(first + width, len(position)))
-        rows = np.minimum(np.arange(first, first + width), len(position) - 1)
+    cloud = _Cloud(surface)
+    for group, first in enumerate(range(0, len(position), GROUP)):
+        start = np.arange(first, min(first + GROUP, len(position)))
+        rows = np.minimum(np.arange(first, first + GROUP), len(position) - 1)
         random = np.random.Generator(np.random.Philox(np.random.SeedSequence([seed, group])))
         here, inward, worth = _rest(task, cloud, random, position[rows], normal[rows], rounds)
         yield Settled(start, here[: len(start)], inward[: len(start)], float(worth[: len(start)].max()))
