@@ -67,6 +67,13 @@ class _Plan(NamedTuple):
     asked: Any
 
 
+@jax.jit
+def _grasp(surface: SmoothSurface, model: ContactModel, point: Array) -> tuple[Grasp, Array, Array]:
+    """The grasp at points (B, k, 3) of the surface, its positions and normals."""
+    position, normal = surface.slide(point)
+    return Grasp(position - surface.centre, normal, model), position, normal
+
+
 class _Ground(NamedTuple):
     """What every step needs."""
 
@@ -76,9 +83,7 @@ class _Ground(NamedTuple):
     requirements: tuple[Requirement, ...]
 
     def grasp(self, point: Array) -> tuple[Grasp, Array, Array]:
-        """The grasp at points (B, k, 3) of the surface, its positions and normals."""
-        position, normal = self.surface.slide(point)
-        return Grasp(position - self.surface.centre, normal, self.model), position, normal
+        return _grasp(self.surface, self.model, point)
 
     def scores(self, point: Array, memory: Any) -> tuple[Array, Array]:
         """The sum of the finite ones of (B,) scores, and these: objective less penalty."""
@@ -123,11 +128,6 @@ def _advance(
         return carry[0] + 1, _round(plan.optimizer, ground, carry[1], limit)
 
     return lax.while_loop(unfinished, one, (jnp.int32(0), lanes))[1]
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _grasp(plan: _Plan, numbers: Any, surface: SmoothSurface, model: ContactModel, point: Array) -> Grasp:
-    return _ground(plan, numbers, surface, model).grasp(point)[0]
 
 
 def _round(optimizer: optax.GradientTransformation, ground: _Ground, lanes: _Lanes, limit: Array) -> _Lanes:
@@ -204,7 +204,7 @@ def climb(
             entered = np.isin(np.arange(width), free)
             lanes = fresh if lanes is None else _entered(jnp.asarray(entered), fresh, lanes)
         if objective.interval > 1:
-            grasp = _grasp(plan, numbers, surface, model, lanes.point)
+            grasp = _grasp(surface, model, lanes.point)[0]
             lanes = lanes._replace(memory=look(objective, grasp, lanes.memory))
         lanes = _advance(plan, numbers, surface, model, lanes, limit)
         over = np.flatnonzero((owner >= 0) & ~np.asarray(lanes.alive))
