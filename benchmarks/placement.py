@@ -42,12 +42,12 @@ from scipy.optimize import minimize
 
 import jaxgrasp as jg
 from jaxgrasp import objects, surfaces
-from jaxgrasp.contacts import ContactModel
-from jaxgrasp.effort import effort_map, torque_lengths
-from jaxgrasp.objectives import Epsilon, Margin, lessons
-from jaxgrasp.placement import CANDIDATES, Placement, place_contacts
-from jaxgrasp.settling import ROUNDS, TRIALS
-from jaxgrasp.surfaces import MeshSurface
+from jaxgrasp.contacts.models import ContactModel
+from jaxgrasp.placement.objectives import Epsilon, Margin, lessons
+from jaxgrasp.placement.place import CANDIDATES, Placement, place_contacts
+from jaxgrasp.placement.settle import ROUNDS, TRIALS
+from jaxgrasp.quality.unit_wrench_space import effort_map, torque_lengths
+from jaxgrasp.surfaces.mesh import MeshSurface
 
 REAL = (
     "ycb/005_tomato_soup_can.obj.gz", "ycb/009_gelatin_box.obj.gz", "ycb/011_banana.obj.gz",

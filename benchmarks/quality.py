@@ -28,7 +28,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 import jaxgrasp as jg
-from jaxgrasp.effort import effort_map, torque_lengths
+from jaxgrasp.quality.unit_wrench_space import effort_map, torque_lengths
 
 
 def resistant_grasps(count: int, k: int, seed: int) -> jg.Grasp:

@@ -4,43 +4,14 @@ Names follow the chapter "Wrench Resistant Grasps"; wrench resistance is what ot
 """
 
 from . import surfaces
-from .certificate import check_certificate
-from .closed_loop import ClosedLoop, close_loop
-from .contacts import ContactModel, Frictionless, HardFinger, SoftFinger
-from .control import ComputedTorque, ControlStatus, Gains, Reference
-from .controllability import (
-    Controllability,
-    ControllabilityVerdict,
-    controllability,
-    controllability_matrix,
-    gramian,
-)
-from .controllability_words import explain_controllability
-from .criteria import Criterion, Gentlest, LeastNorm, Robust, SmallestSum, SumOfSquares
-from .critical_friction import CriticalFriction, critical_friction, friction_sweep, with_friction_factor
-from .dynamics import (
-    BodyState,
-    RigidBody,
-    acceleration,
-    advance,
-    coriolis,
-    gravity_term,
-    mass_matrix,
-    world_grasp_map,
-)
-from .epsilon import EpsilonQuality, epsilon_quality
-from .equilibrium import (
-    Equilibrium,
-    EquilibriumKind,
-    ResistibleWrenches,
-    Squeeze,
-    equilibrium,
-    resistible_wrenches,
-    squeeze,
-)
-from .forces import ForceOptimum, optimize_forces
-from .grasp import (
+from .certificates import check_certificate
+from .conic import Stop
+from .contacts import (
+    ContactModel,
+    Frictionless,
     Grasp,
+    HardFinger,
+    SoftFinger,
     folded_grasp_map,
     grasp_map,
     grasp_rank,
@@ -48,33 +19,87 @@ from .grasp import (
     internal_force_part,
     null_space,
 )
-from .guaranteed_radius import GuaranteedRadius, guaranteed_radius
-from .linearization import Linearization, OperatingPoint, linearize
+from .core import Status
+from .core import __version__ as __version__
+from .forces import (
+    Criterion,
+    Equilibrium,
+    EquilibriumKind,
+    ForceOptimum,
+    Gentlest,
+    LeastNorm,
+    ResistibleWrenches,
+    Robust,
+    SmallestSum,
+    Squeeze,
+    SumOfSquares,
+    equilibrium,
+    optimize_forces,
+    resistible_wrenches,
+    squeeze,
+)
 from .lmi import (
     FrictionLMI,
     LMIFeasibility,
+    LMIForces,
     LMIProblem,
     LMISolution,
     LogDetTerm,
     SDPSolution,
     friction_lmi,
     lmi_feasibility,
+    lmi_forces,
     lmi_margin,
     lmi_minimize,
     margin_lmi,
     sdp_minimize,
     second_order_cone_lmi,
 )
-from .lmi_forces import LMIForces, lmi_forces
-from .measures import TaskQuality, grasp_isotropy, grasp_volume, task_quality
-from .regulator import Regulator, regulator
-from .resistance import WrenchResistance, wrench_resistance
-from .simulation import MujocoPlant, mujoco_model, mujoco_plant
-from .solver import Stop
-from .status import Status
-from .tracing import Trace, load_grasp, save_grasp, trace
-
-__version__ = "0.1.0"
+from .motion import (
+    BodyState,
+    ClosedLoop,
+    ComputedTorque,
+    Controllability,
+    ControllabilityVerdict,
+    ControlStatus,
+    Gains,
+    Linearization,
+    MujocoPlant,
+    OperatingPoint,
+    Reference,
+    Regulator,
+    RigidBody,
+    acceleration,
+    advance,
+    close_loop,
+    controllability,
+    controllability_matrix,
+    coriolis,
+    gramian,
+    gravity_term,
+    linearize,
+    mass_matrix,
+    mujoco_model,
+    mujoco_plant,
+    regulator,
+    world_grasp_map,
+)
+from .quality import (
+    CriticalFriction,
+    EpsilonQuality,
+    GuaranteedRadius,
+    TaskQuality,
+    critical_friction,
+    epsilon_quality,
+    friction_sweep,
+    grasp_isotropy,
+    grasp_volume,
+    guaranteed_radius,
+    task_quality,
+    with_friction_factor,
+)
+from .report import explain_controllability
+from .resistance import Trace, WrenchResistance, trace, wrench_resistance
 
 __all__ = [
     # 11.1 contacts, grasps, internal forces
@@ -177,3 +202,12 @@ __all__ = [
     "Status",
     "check_certificate",
 ]
+
+
+def __getattr__(name: str):
+    """Rooms that load more than NumPy and JAX are imported when they are first used."""
+    if name in ("save_grasp", "load_grasp"):
+        from . import formats
+
+        return getattr(formats, name)
+    raise AttributeError(f"module 'jaxgrasp' has no attribute {name!r}")

@@ -5,6 +5,8 @@
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -31,9 +33,9 @@ import numpy as np
 from IPython.display import Image, display
 
 import jaxgrasp as jg
-from jaxgrasp.candidates import SurfaceSampler
-from jaxgrasp.objects import make
-from jaxgrasp.report import Verdict, draw, explain
+from jaxgrasp.objects.builtin import make_object
+from jaxgrasp.objects.sampling import SurfaceSampler
+from jaxgrasp.report.verdict_words import Verdict, draw, explain
 
 jax.config.update("jax_enable_x64", True)  # without it JAX computes in float32
 plt.rcParams.update({"figure.dpi": 110, "axes.grid": True, "grid.alpha": 0.3, "font.size": 9})
@@ -243,7 +245,7 @@ assert (accepted == resistant).all()
 # the margin is exactly 0.
 
 # %%
-mug = make("mug")
+mug = make_object("mug")
 position, inward = SurfaceSampler(mug, fingers=3, seed=0).rows(0, 2000)
 on_mug = jg.Grasp(position - mug.center_mass, inward, jg.HardFinger(friction=0.5))
 screened = jg.wrench_resistance(on_mug)

@@ -5,6 +5,8 @@
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -34,9 +36,9 @@ import optax
 from IPython.display import Image, display
 
 import jaxgrasp as jg
-from jaxgrasp.candidates import SurfaceSampler
-from jaxgrasp.objects import make
-from jaxgrasp.report import Verdict, draw
+from jaxgrasp.objects.builtin import make_object
+from jaxgrasp.objects.sampling import SurfaceSampler
+from jaxgrasp.report.verdict_words import Verdict, draw
 
 jax.config.update("jax_enable_x64", True)  # without it JAX computes in float32
 jax.config.update(
@@ -510,7 +512,7 @@ for name, changes in forgeries.items():
 # weighs 3 N. Its $z$ axis points up.
 
 # %%
-mug = make("mug")
+mug = make_object("mug")
 position, inward = (x[282] for x in SurfaceSampler(mug, fingers=3, seed=0).rows(0, 300))
 on_mug = jg.Grasp(position - mug.center_mass, inward, jg.HardFinger(friction=0.5))
 carried = jg.optimize_forces(on_mug, np.array([0.0, 0.0, -3.0, 0.0, 0.0, 0.0]), jg.Gentlest())

@@ -5,6 +5,8 @@
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -32,9 +34,9 @@ import numpy as np
 from IPython.display import Image, display
 
 import jaxgrasp as jg
-from jaxgrasp.candidates import SurfaceSampler
-from jaxgrasp.objects import make
-from jaxgrasp.report import Verdict, draw
+from jaxgrasp.objects.builtin import make_object
+from jaxgrasp.objects.sampling import SurfaceSampler
+from jaxgrasp.report.verdict_words import Verdict, draw
 
 jax.config.update("jax_enable_x64", True)  # without it JAX computes in float32
 jax.config.update(
@@ -161,7 +163,7 @@ assert float(swing.cone_use.max()) <= 1 + 1e-9
 # friction cones. Eight lanes: eight sideways pushes of 50 ms, from none to 1.4 times the weight.
 
 # %%
-mug = make("mug")
+mug = make_object("mug")
 position, inward = (x[282] for x in SurfaceSampler(mug, fingers=3, seed=0).rows(0, 300))
 MU = 0.5
 on_mug = jg.Grasp(

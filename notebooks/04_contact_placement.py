@@ -5,6 +5,8 @@
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -28,8 +30,8 @@ import numpy as np
 
 import jaxgrasp as jg
 from jaxgrasp import surfaces
-from jaxgrasp.placement import place_contacts
-from jaxgrasp.requirements import Apart
+from jaxgrasp.placement.place import place_contacts
+from jaxgrasp.placement.requirements import Apart
 
 jax.config.update("jax_enable_x64", True)  # without it JAX computes in float32
 

@@ -3,7 +3,7 @@
 import jax
 import pytest
 
-from jaxgrasp.backend import remember_compilations
+from jaxgrasp.backend.device import remember_compilations
 
 
 @pytest.fixture

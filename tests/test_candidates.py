@@ -2,15 +2,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxgrasp import meshes, objects
-from jaxgrasp.candidates import BLOCK, AntipodalSampler, SurfaceSampler, geometric_filter, slide_escapes
-from jaxgrasp.errors import UserError
-from jaxgrasp.raycast import RayCaster
+from jaxgrasp import objects
+from jaxgrasp.core.errors import UserError
+from jaxgrasp.objects import builtin
+from jaxgrasp.objects.raycast import RayCaster
+from jaxgrasp.objects.sampling import BLOCK, AntipodalSampler, SurfaceSampler, geometric_filter, slide_escapes
 
 
 @pytest.fixture(scope="module")
 def mug():
-    return objects.make("mug")
+    return objects.make_object("mug")
 
 
 def on_faces(mesh, points, normals):
@@ -24,7 +25,7 @@ def on_faces(mesh, points, normals):
 
 @pytest.mark.parametrize("name", ["mug", "box"])
 def test_points_lie_on_the_surface_with_inward_normals(name):
-    mesh = objects.make(name)
+    mesh = objects.make_object(name)
     position, normal = SurfaceSampler(mesh, 3, seed=1).rows(0, 100)
     assert position.shape == normal.shape == (100, 3, 3)
     assert on_faces(mesh, position.reshape(-1, 3), normal.reshape(-1, 3)).max() < 1e-12
@@ -32,7 +33,7 @@ def test_points_lie_on_the_surface_with_inward_normals(name):
 
 
 def test_uniform_over_the_area():
-    mesh = objects.make("box")
+    mesh = objects.make_object("box")
     position, normal = SurfaceSampler(mesh, 1, seed=0).rows(0, 60_000)
     areas = {0: 0.08 * 0.06, 1: 0.12 * 0.06, 2: 0.12 * 0.08}
     for axis, area in areas.items():
@@ -67,7 +68,7 @@ def test_the_guide_table_is_the_search(mug):
 
 
 def test_degenerate_faces_are_never_chosen():
-    vertices, faces = objects.box()
+    vertices, faces = builtin.box()
     mesh = trimesh.Trimesh(vertices, np.concatenate([[[0, 0, 1]], faces, [[2, 2, 2]]]), process=False)
     position, normal = SurfaceSampler(mesh, 2, seed=0).rows(0, BLOCK)
     assert np.isfinite(position).all()
@@ -100,7 +101,7 @@ def test_antipodal_pairs(mug, friction):
 
 
 def test_antipodal_pairs_of_a_box_are_across_it():
-    position, normal = AntipodalSampler(objects.make("box"), 0.0, seed=0).rows(0, 500)
+    position, normal = AntipodalSampler(objects.make_object("box"), 0.0, seed=0).rows(0, 500)
     line = position[:, 1] - position[:, 0]
     axis = np.argmax(np.abs(line), axis=1)
     assert np.linalg.norm(line, axis=1) == pytest.approx(np.array([0.12, 0.08, 0.06])[axis], abs=1e-12)
@@ -115,7 +116,7 @@ def test_an_open_sheet_has_no_antipodal_pairs():
 
 @pytest.mark.parametrize("name", ["mug", "box", "torus"])
 def test_ray_casts_against_every_triangle_in_turn(name):
-    mesh = objects.make(name)
+    mesh = objects.make_object(name)
     random = np.random.default_rng(3)
     points, faces = trimesh.sample.sample_surface(mesh, 200, seed=3)
     points = np.asarray(points)
@@ -159,5 +160,5 @@ def test_the_filter_says_why():
 
 def test_a_body_from_a_file_can_be_sampled(tmp_path, mug):
     mug.export(tmp_path / "mug.ply")
-    position, _ = SurfaceSampler(meshes.load(tmp_path / "mug.ply").mesh, 2, seed=0).rows(0, 10)
+    position, _ = SurfaceSampler(objects.load_mesh(tmp_path / "mug.ply").mesh, 2, seed=0).rows(0, 10)
     assert np.isfinite(position).all()

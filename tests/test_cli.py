@@ -8,8 +8,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from jaxgrasp import __version__, objects
-from jaxgrasp.cli import main
-from jaxgrasp.status import Status
+from jaxgrasp.cli.main import main
+from jaxgrasp.core.status import Status
+from jaxgrasp.objects import builtin
 
 SMALL = ["--samples", "300", "--fingers", "3", "--chunk", "256"]
 
@@ -77,7 +78,7 @@ def test_screen_then_explain(capsys, tmp_path, dtype):
 
 
 def test_a_warning_is_one_line_and_the_work_goes_on(capsys, dtype):
-    vertices, faces = objects.bowl()
+    vertices, faces = builtin.bowl()
     lines = [f"v {x} {y} {z}" for x, y, z in vertices] + [
         f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces[1:]
     ]
@@ -148,7 +149,7 @@ def test_user_errors_are_one_line_and_exit_code_2(capsys, tmp_path, arguments, m
 
 
 def test_ctrl_c_says_how_to_go_on(capsys, monkeypatch, dtype):
-    from jaxgrasp import shards
+    from jaxgrasp.jobs import shards
 
     def interrupt(path, rows):
         raise KeyboardInterrupt

@@ -11,8 +11,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from jaxgrasp import ControllabilityVerdict, Status, checking, shards
-from jaxgrasp.cli import main
+from jaxgrasp import ControllabilityVerdict, Status
+from jaxgrasp.cli.main import main
+from jaxgrasp.jobs import motion as checking
+from jaxgrasp.jobs import shards
 
 V = ControllabilityVerdict
 pytestmark = pytest.mark.skipif(not jax.config.jax_enable_x64, reason="the command works in float64")
@@ -113,8 +115,8 @@ KILLED = """
 import sys, time
 sys.path.insert(0, {tests!r})
 from test_cli_check import quick
-from jaxgrasp import checking
-from jaxgrasp.cli import main
+from jaxgrasp.jobs import motion as checking
+from jaxgrasp.cli.main import main
 def slow(run, contacts):
     time.sleep(0.3)
     return quick(run, contacts)

@@ -16,14 +16,16 @@ import pyarrow.parquet as pq
 import pytest
 
 import jaxgrasp as jg
-from jaxgrasp import Status, loading
-from jaxgrasp.backend import precision
-from jaxgrasp.cli import main
-from jaxgrasp.errors import UserError
-from jaxgrasp.force_report import ForceAnswer, contact_rows, cost_words, infeasible_words, load_words
+from jaxgrasp import Status
+from jaxgrasp.backend.device import precision
+from jaxgrasp.cli.main import main
+from jaxgrasp.core.errors import UserError
+from jaxgrasp.forces.named_criteria import CRITERIA, make_criterion
 from jaxgrasp.formats.parquet import read_metadata
-from jaxgrasp.loading import ForceSummary
-from jaxgrasp.loads import CRITERIA, LoadRequest, make_criterion, prepare
+from jaxgrasp.jobs import forces as loading
+from jaxgrasp.jobs.forces import ForceSummary
+from jaxgrasp.jobs.load import LoadRequest, prepare_load
+from jaxgrasp.report.force_words import ForceAnswer, contact_rows, cost_words, infeasible_words, load_words
 
 WEIGHT = 0.3 * 9.81
 LOAD = ["--mass", "0.3", "--gravity", "0,0,-1"]
@@ -384,13 +386,13 @@ def test_every_criterion_has_its_object():
 
 def test_gravity_is_a_direction_and_g_its_size(screened):
     def wrench(**options):
-        return prepare(LoadRequest(screened, mass=2.0, row=3, **options)).load.wrench
+        return prepare_load(LoadRequest(screened, mass=2.0, row=3, **options)).load.wrench
 
     assert wrench().tolist() == [0, 0, -2 * 9.81, 0, 0, 0]
     assert wrench(gravity=(3.0, 0.0, -4.0), g=10.0) == pytest.approx([12, 0, -16, 0, 0, 0], rel=1e-15)
     assert wrench(gravity=(0.0, -9.81, 0.0)) == pytest.approx([0, -19.62, 0, 0, 0, 0], rel=1e-15)
     jg.save_grasp("planar.npz", jg.Grasp([[-1.0, 0], [1, 0]], [[1.0, 0], [-1, 0]], jg.HardFinger(0.5)))
-    planar = prepare(LoadRequest("planar.npz", mass=1.0))
+    planar = prepare_load(LoadRequest("planar.npz", mass=1.0))
     assert planar.load.wrench.tolist() == [0, -9.81, 0] and planar.load.assumed and planar.row == 0
 
 

@@ -1,5 +1,7 @@
 """``jaxgrasp place`` as a user runs it."""
 
+import importlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,10 +9,13 @@ import pyarrow.parquet as pq
 import pytest
 
 import jaxgrasp as jg
-from jaxgrasp import cli_place, placing
-from jaxgrasp.cli import main
+from jaxgrasp.cli.main import main
 from jaxgrasp.formats.parquet import ContactFile, read_metadata, read_row
-from jaxgrasp.requirements import SLACK
+from jaxgrasp.placement.requirements import SLACK
+
+# The rooms have functions of the same names.
+cli_place = importlib.import_module("jaxgrasp.cli.place")
+placing = importlib.import_module("jaxgrasp.jobs.place")
 
 pytestmark = pytest.mark.skipif(not jax.config.jax_enable_x64, reason="the command works in float64")
 FEW = [
@@ -94,7 +99,7 @@ def test_explain_reads_the_file(placed, capsys):
 
 def test_the_summary_is_printed(placed, capsys):
     _, _, told = placed
-    run = placing.prepare(placing.PlaceRequest("box", starts=24))
+    run = placing.prepare_place(placing.PlaceRequest("box", starts=24))
     cli_place._print_summary(cli_place.Console(), run, told)
     said = capsys.readouterr().out
     held = int(told.placement.resistant.sum())

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgrasp import cones
-from jaxgrasp.solver.interior_point import nesterov_todd
+from jaxgrasp.conic import cone as cones
+from jaxgrasp.conic.scaling import nesterov_todd
 
 K, LANES = 3, 40
 DIMENSIONS = [1, 2, 3, 4]

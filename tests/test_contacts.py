@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxgrasp as jg
-from jaxgrasp.contacts import Component
+from jaxgrasp.contacts.models import Component
 
 MU, GAMMA = 0.4, 0.02
 MODELS = [

@@ -9,9 +9,9 @@ from scipy.linalg import solve_discrete_are
 from scipy.spatial.transform import Rotation
 
 import jaxgrasp as jg
-from jaxgrasp.admissible import cone_use, into_cones, nearest_admissible
-from jaxgrasp.control import tracking_error
-from jaxgrasp.regulator import riccati
+from jaxgrasp.contacts.friction_cones import cone_use, into_cones, nearest_admissible
+from jaxgrasp.motion.computed_torque import tracking_error
+from jaxgrasp.motion.regulator import riccati
 
 C = jg.ControlStatus
 RNG = np.random.default_rng(43)

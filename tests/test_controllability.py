@@ -10,8 +10,8 @@ from families import KINDS, random_active, random_coefficients, random_contacts,
 from motion_families import random_bodies
 
 import jaxgrasp as jg
-from jaxgrasp._types import rank_tolerance
-from jaxgrasp.linearization import scaled_system
+from jaxgrasp.core.tolerances import rank_tolerance
+from jaxgrasp.motion.linearization import scaled_system
 
 V = jg.ControllabilityVerdict
 RNG = np.random.default_rng(41)
@@ -217,7 +217,7 @@ def test_A_and_B_are_the_derivatives_of_the_motion(dimension):
         return jnp.concatenate([state.velocity, jg.acceleration(body, state, wrench, gravity)])
 
     A, B = jax.jacfwd(motion, argnums=(0, 1))(jnp.zeros(2 * m), jnp.asarray(force))
-    from jaxgrasp.linearization import _blocks  # the forces may pull: only the matrices are asked for
+    from jaxgrasp.motion.linearization import _blocks
 
     A_c, B_c = _blocks(grasp, body, jnp.asarray(gravity))
     np.testing.assert_allclose(A[m:, :m], A_c, atol=1e-11)

@@ -9,7 +9,7 @@ from motion_families import random_bodies, random_states
 from scipy.spatial.transform import Rotation
 
 import jaxgrasp as jg
-from jaxgrasp.rotations import (
+from jaxgrasp.core.rotations import (
     jacobian_product,
     jacobian_solve,
     orientation_matrix,
@@ -265,7 +265,7 @@ def test_rotating_everything_rotates_the_answer(dtype):
     turn = random_rotation(RNG)
     q = Rotation.from_matrix(turn).as_quat()[[3, 0, 1, 2]].astype(dtype)
     body, state = random_bodies(RNG, 3, 3, dtype), random_states(RNG, 3, 3, dtype)
-    from jaxgrasp.rotations import quaternion_product
+    from jaxgrasp.core.rotations import quaternion_product
 
     wrench, g = RNG.normal(size=(3, 6)).astype(dtype), RNG.normal(size=3).astype(dtype)
     both = np.kron(np.eye(2), turn).astype(dtype)

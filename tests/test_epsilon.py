@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 
 import jaxgrasp as jg
 from jaxgrasp import Status
-from jaxgrasp.effort import effort_map, scaled, torque_lengths
+from jaxgrasp.quality.unit_wrench_space import effort_map, scaled, torque_lengths
 
 
 def ball(rng, count, k, tilt=0.3):

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import jaxgrasp as jg
-from jaxgrasp.lmi import friction_lmi, lmi_feasibility, lmi_margin, second_order_cone_lmi
+from jaxgrasp.lmi.feasibility import lmi_feasibility, second_order_cone_lmi
+from jaxgrasp.lmi.friction import friction_lmi, lmi_margin
 
 
 def tolerance(dtype):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgrasp.geometry import contact_frame, cross, normalize, skew, wrench_dimension
+from jaxgrasp.core.geometry import contact_frame, cross, normalize, skew, wrench_dimension
 
 
 def tolerance(dtype):

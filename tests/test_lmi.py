@@ -7,15 +7,10 @@ import pytest
 from clarabel_oracle import clarabel_margin
 
 import jaxgrasp as jg
-from jaxgrasp.lmi import (
-    LMIProblem,
-    friction_lmi,
-    lmi_feasibility,
-    lmi_margin,
-    lmi_minimize,
-    margin_lmi,
-    second_order_cone_lmi,
-)
+from jaxgrasp.lmi.barrier import lmi_minimize
+from jaxgrasp.lmi.feasibility import lmi_feasibility, second_order_cone_lmi
+from jaxgrasp.lmi.friction import friction_lmi, lmi_margin, margin_lmi
+from jaxgrasp.lmi.problem import LMIProblem
 
 MODELS = [
     pytest.param(jg.Frictionless(), 2, id="frictionless-planar"),

@@ -6,8 +6,9 @@ import pytest
 import trimesh
 from real_data import real_meshes
 
-from jaxgrasp import meshes, objects
-from jaxgrasp.errors import UserError
+from jaxgrasp import objects
+from jaxgrasp.core.errors import UserError
+from jaxgrasp.objects import builtin
 
 
 @pytest.fixture
@@ -26,14 +27,14 @@ def write_obj(path, vertices, faces):
 
 
 def test_a_built_in_object():
-    body = meshes.load("mug")
+    body = objects.load_mesh("mug")
     assert body.watertight and body.warnings == () and body.name == "mug" and body.unit == "m"
-    assert body.centre_of_mass == pytest.approx(objects.make("mug").center_mass, abs=1e-12)
-    assert body.sha256 == meshes.load("mug").sha256 != meshes.load("bowl").sha256
+    assert body.centre_of_mass == pytest.approx(objects.make_object("mug").center_mass, abs=1e-12)
+    assert body.sha256 == objects.load_mesh("mug").sha256 != objects.load_mesh("bowl").sha256
 
 
 def test_a_file(box_file):
-    body = meshes.load(box_file)
+    body = objects.load_mesh(box_file)
     assert body.watertight and body.warnings == ()
     assert body.centre_of_mass == pytest.approx([1, 2, 3], abs=1e-7)
     assert body.sha256 == hashlib.sha256(box_file.read_bytes()).hexdigest()
@@ -41,7 +42,7 @@ def test_a_file(box_file):
 
 @pytest.mark.parametrize(("unit", "scale"), [("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("in", 0.0254)])
 def test_units_scale_the_mesh_and_the_centre(box_file, unit, scale):
-    body = meshes.load(box_file, unit)
+    body = objects.load_mesh(box_file, unit)
     assert body.mesh.extents == pytest.approx(scale * np.array([0.1, 0.2, 0.3]), rel=1e-6)
     assert body.centre_of_mass == pytest.approx(scale * np.array([1.0, 2.0, 3.0]), rel=1e-6)
 
@@ -49,8 +50,8 @@ def test_units_scale_the_mesh_and_the_centre(box_file, unit, scale):
 def test_gzip(box_file, tmp_path):
     packed = tmp_path / "box.stl.gz"
     packed.write_bytes(gzip.compress(box_file.read_bytes()))
-    body = meshes.load(packed)
-    assert np.array_equal(body.mesh.triangles, meshes.load(box_file).mesh.triangles)
+    body = objects.load_mesh(packed)
+    assert np.array_equal(body.mesh.triangles, objects.load_mesh(box_file).mesh.triangles)
     assert body.sha256 == hashlib.sha256(packed.read_bytes()).hexdigest()
 
 
@@ -61,14 +62,14 @@ def test_a_scene_is_merged(tmp_path):
     scene.add_geometry(trimesh.creation.box(extents=(0.1, 0.1, 0.1)), transform=shift)
     path = tmp_path / "two.glb"
     path.write_bytes(scene.export(file_type="glb"))
-    body = meshes.load(path)
+    body = objects.load_mesh(path)
     assert body.watertight and len(body.mesh.faces) == 24
     assert body.centre_of_mass == pytest.approx([0.15, 0, 0], abs=1e-7)
 
 
 def test_not_watertight_names_the_consequence(tmp_path):
     vertices = [(0, 0, 0), (0.1, 0, 0), (0, 0.1, 0)]
-    body = meshes.load(write_obj(tmp_path / "leaf.obj", vertices, [(0, 1, 2)]))
+    body = objects.load_mesh(write_obj(tmp_path / "leaf.obj", vertices, [(0, 1, 2)]))
     assert not body.watertight
     assert body.centre_of_mass == pytest.approx([0.1 / 3, 0.1 / 3, 0])
     (warning,) = body.warnings
@@ -77,45 +78,45 @@ def test_not_watertight_names_the_consequence(tmp_path):
 
 def test_centre_of_an_open_surface_is_weighted_by_area(tmp_path):
     vertices = [(0, 0, 0), (0.1, 0, 0), (0, 0.1, 0), (1, 0, 0), (1.2, 0, 0), (1, 0.2, 0)]
-    body = meshes.load(write_obj(tmp_path / "two.obj", vertices, [(0, 1, 2), (3, 4, 5)]))
+    body = objects.load_mesh(write_obj(tmp_path / "two.obj", vertices, [(0, 1, 2), (3, 4, 5)]))
     first, second = np.array([0.1 / 3, 0.1 / 3, 0]), np.array([1 + 0.2 / 3, 0.2 / 3, 0])
     assert body.centre_of_mass == pytest.approx((0.005 * first + 0.02 * second) / 0.025)
 
 
 def test_given_centre_of_mass_wins(box_file):
-    assert meshes.load(box_file, com=(0.1, 0.2, 0.3)).centre_of_mass == pytest.approx([0.1, 0.2, 0.3])
+    assert objects.load_mesh(box_file, com=(0.1, 0.2, 0.3)).centre_of_mass == pytest.approx([0.1, 0.2, 0.3])
     with pytest.raises(UserError, match="three finite numbers"):
-        meshes.load(box_file, com=(0.1, 0.2))
+        objects.load_mesh(box_file, com=(0.1, 0.2))
     with pytest.raises(UserError, match="three finite numbers"):
-        meshes.load(box_file, com=(0.1, 0.2, float("nan")))
+        objects.load_mesh(box_file, com=(0.1, 0.2, float("nan")))
 
 
 @pytest.mark.parametrize("unit", ["mm", "m"])
 def test_suspect_units_warn_with_the_extents(tmp_path, unit):
     path = tmp_path / "part.stl"
     trimesh.creation.box(extents=(20, 30, 40) if unit == "m" else (0.2, 0.3, 0.4)).export(path)
-    (warning,) = meshes.load(path, unit).warnings
+    (warning,) = objects.load_mesh(path, unit).warnings
     assert "--unit" in warning
     assert ("20 x 30 x 40" if unit == "m" else "0.0002 x 0.0003 x 0.0004") in warning
 
 
 @pytest.mark.parametrize("flipped", ["all", "some"])
 def test_faces_that_point_inwards_are_turned(tmp_path, flipped):
-    vertices, faces = objects.torus()
+    vertices, faces = builtin.torus()
     faces = faces.copy()
     chosen = slice(None) if flipped == "all" else slice(None, None, 3)
     faces[chosen] = faces[chosen, ::-1]
-    body = meshes.load(write_obj(tmp_path / "torus.obj", vertices, faces))
-    assert body.watertight and body.mesh.volume == pytest.approx(objects.make("torus").volume)
+    body = objects.load_mesh(write_obj(tmp_path / "torus.obj", vertices, faces))
+    assert body.watertight and body.mesh.volume == pytest.approx(objects.make_object("torus").volume)
     assert any("pointed inwards" in warning for warning in body.warnings)
 
 
 def test_an_open_mesh_that_points_inwards_warns(tmp_path):
-    vertices, faces = objects.sphere()
+    vertices, faces = builtin.sphere()
     path = write_obj(tmp_path / "shell.obj", vertices, faces[1:, ::-1])
-    assert any("seem to point inwards" in warning for warning in meshes.load(path).warnings)
+    assert any("seem to point inwards" in warning for warning in objects.load_mesh(path).warnings)
     path = write_obj(tmp_path / "shell.obj", vertices, faces[1:])
-    assert not any("seem to point inwards" in warning for warning in meshes.load(path).warnings)
+    assert not any("seem to point inwards" in warning for warning in objects.load_mesh(path).warnings)
 
 
 def no_faces(path):
@@ -159,21 +160,21 @@ def test_bad_files_get_one_clear_line(tmp_path, name, make, message):
     path = tmp_path / name
     make(path)
     with pytest.raises(UserError, match=message) as error:
-        meshes.load(path)
+        objects.load_mesh(path)
     assert "\n" not in str(error.value)
 
 
 def test_a_unit_for_a_built_in_object_is_refused():
     with pytest.raises(UserError, match="in metres"):
-        meshes.load("mug", "mm")
+        objects.load_mesh("mug", "mm")
     with pytest.raises(UserError, match="unknown unit"):
-        meshes.load("mug", "furlong")
+        objects.load_mesh("mug", "furlong")
 
 
 def test_degenerate_faces_do_not_matter(tmp_path):
-    vertices, faces = objects.box()
+    vertices, faces = builtin.box()
     faces = np.concatenate([faces, [[0, 0, 1], [1, 1, 1]]])
-    body = meshes.load(write_obj(tmp_path / "box.obj", vertices, faces))
+    body = objects.load_mesh(write_obj(tmp_path / "box.obj", vertices, faces))
     assert np.isfinite(body.centre_of_mass).all()
     assert body.mesh.area == pytest.approx(2 * (0.12 * 0.08 + 0.12 * 0.06 + 0.08 * 0.06))
 
@@ -183,7 +184,7 @@ def test_every_real_mesh_loads_or_says_why_not():
     files = [f for f in sorted(real_meshes().glob("*/*")) if f.is_file() and f.suffix not in (".md", ".txt")]
     watertight = 0
     for file in files:
-        body = meshes.load(file)
+        body = objects.load_mesh(file)
         assert np.isfinite(body.centre_of_mass).all(), file
         low, high = body.mesh.bounds
         assert (low <= body.centre_of_mass).all() and (body.centre_of_mass <= high).all(), file

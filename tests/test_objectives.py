@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import jaxgrasp as jg
-from jaxgrasp.effort import effort_map, signed_supports, torque_lengths
-from jaxgrasp.facets import facet_normal
-from jaxgrasp.objectives import Epsilon, EpsilonFloor, Margin, Measure, _floor, objective
+from jaxgrasp.placement.objectives import Epsilon, EpsilonFloor, Margin, Measure, _floor, objective
+from jaxgrasp.quality.boundary_along import facet_normal
+from jaxgrasp.quality.unit_wrench_space import effort_map, signed_supports, torque_lengths
 
 pytestmark = pytest.mark.skipif(not jax.config.jax_enable_x64, reason="compares to 1e-9")
 SCALE = 0.07

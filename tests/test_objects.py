@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 
 from jaxgrasp import objects
-from jaxgrasp.errors import UserError
+from jaxgrasp.core.errors import UserError
 
 
 @pytest.mark.parametrize("name", list(objects.OBJECTS))
 def test_a_closed_surface_of_everyday_size(name):
-    mesh = objects.make(name)
+    mesh = objects.make_object(name)
     assert mesh.is_watertight and mesh.is_winding_consistent
     assert mesh.volume > 0
     assert 0.05 <= mesh.extents.max() <= 0.20
@@ -19,7 +19,7 @@ def test_a_closed_surface_of_everyday_size(name):
 
 @pytest.mark.parametrize("name", list(objects.OBJECTS))
 def test_the_same_every_time(name):
-    first, second = objects.make(name), objects.make(name)
+    first, second = objects.make_object(name), objects.make_object(name)
     assert np.array_equal(first.vertices, second.vertices) and np.array_equal(first.faces, second.faces)
 
 
@@ -33,7 +33,7 @@ def test_the_same_every_time(name):
     ],
 )
 def test_volumes_of_the_shapes_they_approximate(name, volume):
-    mesh = objects.make(name)
+    mesh = objects.make_object(name)
     assert 0.985 * volume <= mesh.volume <= volume * (1 + 1e-9)
     assert np.allclose(mesh.center_mass, 0, atol=1e-9)
 
@@ -42,11 +42,11 @@ def test_volumes_of_the_shapes_they_approximate(name, volume):
     ("name", "holes"), [("mug", 1), ("torus", 1), ("bottle", 0), ("bowl", 0), ("box", 0)]
 )
 def test_number_of_handles(name, holes):
-    assert objects.make(name).euler_number == 2 - 2 * holes
+    assert objects.make_object(name).euler_number == 2 - 2 * holes
 
 
 def test_the_mug_has_a_cavity_a_wall_and_a_handle():
-    mesh = objects.make("mug")
+    mesh = objects.make_object("mug")
     sections = 64
     polygon = sections / 2 * np.sin(2 * np.pi / sections)  # area of the 64-gon in a unit circle
     cup = polygon * (0.040**2 * 0.095 - 0.036**2 * (0.095 - 0.006))
@@ -62,4 +62,4 @@ def test_the_mug_has_a_cavity_a_wall_and_a_handle():
 
 def test_unknown_name_lists_the_known_ones():
     with pytest.raises(UserError, match="mug"):
-        objects.make("teacup")
+        objects.make_object("teacup")

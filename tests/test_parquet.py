@@ -5,7 +5,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from jaxgrasp.errors import UserError
+from jaxgrasp.core.errors import UserError
 from jaxgrasp.formats import parquet
 from jaxgrasp.formats.parquet import ContactFile, Contacts, Verdicts
 
@@ -219,6 +219,6 @@ def test_damaged_and_foreign_files(tmp_path):
 
 
 def test_the_result_of_the_solver_has_the_columns():
-    from jaxgrasp.resistance import WrenchResistance
+    from jaxgrasp.resistance.solve import WrenchResistance
 
     assert set(Verdicts.__dataclass_fields__) <= set(WrenchResistance.__dataclass_fields__)

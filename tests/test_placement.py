@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 import jaxgrasp as jg
-from jaxgrasp import placement, surfaces
-from jaxgrasp.errors import UserError
-from jaxgrasp.objectives import Epsilon, EpsilonFloor
-from jaxgrasp.requirements import SLACK, Apart, Beyond, EdgeClearance, JawWidth, Requirement, Within
+from jaxgrasp import surfaces
+from jaxgrasp.core.errors import UserError
+from jaxgrasp.placement import place as placement
+from jaxgrasp.placement.objectives import Epsilon, EpsilonFloor
+from jaxgrasp.placement.requirements import SLACK, Apart, Beyond, EdgeClearance, JawWidth, Requirement, Within
 
 
 class NotNumbers(Requirement):

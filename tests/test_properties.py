@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 import jaxgrasp as jg
 from jaxgrasp import Status
-from jaxgrasp.contacts import Component
-from jaxgrasp.margin import Contacts, fold
+from jaxgrasp.contacts.folded import Contacts, fold
+from jaxgrasp.contacts.models import Component
 
 K, COUNT = 6, 128  # one compiled shape: soft fingers, among them hard (gamma = 0) and frictionless ones
 SETTINGS = settings(

@@ -1,6 +1,5 @@
-"""What the documents show is what happens: commands, example, printed words, notebook pairs, layers."""
+"""What the documents show is what happens: commands, example, printed words, notebook pairs."""
 
-import ast
 import json
 import os
 import re
@@ -127,24 +126,6 @@ def test_linked_files_exist():
     assert len(local) >= 5
     missing = [target for target in local if not (ROOT / target).exists()]
     assert missing == []
-
-
-# Layers ------------------------------------------------------------------------------------------------
-
-
-def test_the_documented_layers_are_the_enforced_ones():
-    """The table of docs/architecture.md lists the floors of test_layers.py in the same order."""
-    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-    table = re.search(r"<!-- layers -->\n(.*?)<!-- /layers -->", text, re.S)
-    assert table is not None
-    named = re.findall(r"^\| `([\w.]+)` \|", table[1], re.M)
-    tree = ast.parse((ROOT / "tests" / "test_layers.py").read_text(encoding="utf-8"))
-    (floors,) = (
-        ast.literal_eval(node.value)
-        for node in tree.body
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "FLOORS"
-    )
-    assert named == [floor or "jaxgrasp" for floor in floors]
 
 
 # Notebooks ---------------------------------------------------------------------------------------------

@@ -5,11 +5,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxgrasp import drawing, meshes, objects, report
-from jaxgrasp.errors import UserError
-from jaxgrasp.geometry import contact_frame
-from jaxgrasp.report import Verdict, explain, reprove, screw
-from jaxgrasp.status import Status
+from jaxgrasp import objects
+from jaxgrasp.core.errors import UserError
+from jaxgrasp.core.geometry import contact_frame
+from jaxgrasp.core.status import Status
+from jaxgrasp.report import drawing
+from jaxgrasp.report import verdict_words as report
+from jaxgrasp.report.verdict_words import Verdict, explain, reprove_verdict
+from jaxgrasp.report.words import screw
 
 COM = np.array([0.01, -0.02, 0.03])
 
@@ -165,18 +168,18 @@ def test_what_is_wrong_with_an_invalid_grasp():
     ):
         assert line in told
     assert "no contact is active" in explain(verdict(status=Status.INVALID, active=np.zeros(2, bool)))
-    assert "nothing to prove" in reprove(broken, {"dtype": "float64"})
-    assert "do not fit" in reprove(verdict(status=Status.INVALID), {"dtype": "float64"})
+    assert "nothing to prove" in reprove_verdict(broken, {"dtype": "float64"})
+    assert "do not fit" in reprove_verdict(verdict(status=Status.INVALID), {"dtype": "float64"})
     with pytest.raises(UserError, match="invalid grasp has no picture"):
         report.draw(broken, Path("never.png"))
 
 
 def test_stored_evidence_is_proved_again():
     metadata = {"dtype": "float64", "tolerance": 1e-8}
-    assert "the proof holds" in reprove(verdict(), metadata)
-    assert "does NOT" in reprove(verdict(twist=np.array([0.0, 0, 0, 0, 1, 0])), metadata)
-    assert "does NOT" in reprove(verdict(status=Status.RESISTANT), metadata)
-    assert "nothing to prove" in reprove(verdict(status=Status.UNDECIDED), metadata)
+    assert "the proof holds" in reprove_verdict(verdict(), metadata)
+    assert "does NOT" in reprove_verdict(verdict(twist=np.array([0.0, 0, 0, 0, 1, 0])), metadata)
+    assert "does NOT" in reprove_verdict(verdict(status=Status.RESISTANT), metadata)
+    assert "nothing to prove" in reprove_verdict(verdict(status=Status.UNDECIDED), metadata)
 
 
 def test_rows_without_metadata_are_refused():
@@ -200,7 +203,7 @@ def test_forces_are_drawn_in_the_solver_s_frame():
     ],
 )
 def test_pictures(tmp_path, shown):
-    mesh = objects.make("box")
+    mesh = objects.make_object("box")
     report.draw(shown, tmp_path / "a.png", mesh)
     report.draw(shown, tmp_path / "b.png", mesh)
     data = (tmp_path / "a.png").read_bytes()
@@ -235,5 +238,5 @@ def test_large_meshes_are_simplified_for_drawing():
     simple = drawing._simpler(sphere)
     assert len(simple.faces) <= drawing.MOST_FACES < len(sphere.faces)
     assert simple.extents == pytest.approx(sphere.extents, rel=0.05)
-    mug = meshes.load("mug").mesh
+    mug = objects.load_mesh("mug").mesh
     assert drawing._simpler(mug) is mug

@@ -8,7 +8,7 @@ from families import random_active, random_coefficients, random_contacts
 
 import jaxgrasp as jg
 from jaxgrasp import Status
-from jaxgrasp.solver import Stop
+from jaxgrasp.conic.stop import Stop
 
 TIGHT = {"float64": 2e-8, "float32": 5e-3}
 F32 = pytest.mark.f32
@@ -265,7 +265,7 @@ def test_bits_do_not_depend_on_batch_neighbours_or_position(batch, verdict_only)
 
 
 def test_bits_do_not_depend_on_the_tile(batch, monkeypatch):
-    from jaxgrasp import resistance
+    from jaxgrasp.resistance import solve as resistance
 
     whole = jg.wrench_resistance(build(batch))
     for width in (16, 32):

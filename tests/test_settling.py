@@ -6,10 +6,11 @@ import pytest
 import trimesh
 
 import jaxgrasp as jg
-from jaxgrasp import placement, surfaces
-from jaxgrasp.objectives import Measure
-from jaxgrasp.requirements import Apart, Beyond
-from jaxgrasp.settling import CLOUD, settle
+from jaxgrasp import surfaces
+from jaxgrasp.placement import place as placement
+from jaxgrasp.placement.objectives import Measure
+from jaxgrasp.placement.requirements import Apart, Beyond
+from jaxgrasp.placement.settle import CLOUD, settle
 
 MODEL = jg.HardFinger(0.5)
 TARGET = np.array([[0.06, 0.0, 0.0], [0.0, 0.06, 0.0]])

@@ -11,8 +11,8 @@ from families import random_contacts
 from motion_families import random_bodies, random_states
 
 import jaxgrasp as jg
-from jaxgrasp.linearization import _blocks
-from jaxgrasp.simulation import tangent, tangent_difference
+from jaxgrasp.motion.linearization import _blocks
+from jaxgrasp.motion.mujoco import tangent, tangent_difference
 
 pytestmark = pytest.mark.skipif(not jax.config.jax_enable_x64, reason="both engines are compared in float64")
 H = 0.002
@@ -98,7 +98,7 @@ def test_mujocos_step_is_their_semi_implicit_image(scene, derivatives):
 @pytest.mark.slow
 def test_mjx_alone_forgets_how_a_resting_body_starts_to_turn():
     """Why the plant integrates rotations below 1e-8 rad/s itself. Fails when MJX no longer needs that."""
-    from jaxgrasp.simulation import _mjx
+    from jaxgrasp.motion.mujoco import _mjx
 
     plant = jg.mujoco_plant(jg.RigidBody(1.0, np.eye(3)), H)
 

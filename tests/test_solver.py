@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_matrix
 
-from jaxgrasp import lanes
-from jaxgrasp.singular import row_svd
-from jaxgrasp.solver import ConeProgram, Iterate, Stop, linear
-from jaxgrasp.solver.interior_point import begin, solve
-from jaxgrasp.solver.linear import cholesky, gram, inverse_frobenius, matvec, rmatvec
-from jaxgrasp.solver.linear import solve as solve_factored
+from jaxgrasp.backend import tiles as lanes
+from jaxgrasp.conic import linear
+from jaxgrasp.conic.cone_program import ConeProgram
+from jaxgrasp.conic.interior_point import Iterate, begin_cone_program, solve_cone_program
+from jaxgrasp.conic.linear import cholesky, cholesky_solve, gram, inverse_frobenius, matvec, rmatvec
+from jaxgrasp.conic.singular_values import row_svd
+from jaxgrasp.conic.stop import Stop
 
 LANES, K, TOLERANCE = 24, 4, 32 * np.finfo(float).eps
 
@@ -48,7 +49,7 @@ def test_cholesky_solves(m):
     for j, column in enumerate(factor.columns):
         L[:, j:, j] = np.asarray(column).T
     np.testing.assert_allclose(L, np.linalg.cholesky(M), rtol=1e-10, atol=1e-12)
-    x = np.stack(solve_factored(factor, vector(rhs)), -1)
+    x = np.stack(cholesky_solve(factor, vector(rhs)), -1)
     np.testing.assert_allclose(x, np.linalg.solve(M, rhs[..., None])[..., 0], rtol=1e-7, atol=1e-9)
     expected = np.trace(np.linalg.inv(M), axis1=1, axis2=2)
     np.testing.assert_allclose(inverse_frobenius(factor), expected, rtol=1e-8)
@@ -62,7 +63,7 @@ def test_cholesky_solves_consistent_singular_systems(m, rank):
     M = B @ np.swapaxes(B, 1, 2)
     rhs = (M @ rng.normal(size=(LANES, m, 1)))[..., 0]
     factor = cholesky(lower_columns(M), TOLERANCE)
-    x = np.stack(solve_factored(factor, vector(rhs)), -1)
+    x = np.stack(cholesky_solve(factor, vector(rhs)), -1)
     size = np.linalg.norm(rhs, axis=-1)
     assert (np.linalg.norm((M @ x[..., None])[..., 0] - rhs, axis=-1) <= 1e-8 * size).all()
     # Rounding may pass for a pivot, but never for a smallest eigenvalue beyond rounding.
@@ -73,16 +74,16 @@ def test_cholesky_solves_consistent_singular_systems(m, rank):
 
 def test_cholesky_of_nothing_is_nothing():
     factor = cholesky(lower_columns(np.zeros((LANES, 6, 6))), TOLERANCE)
-    assert (np.stack(solve_factored(factor, vector(np.ones((LANES, 6))))) == 0).all()
+    assert (np.stack(cholesky_solve(factor, vector(np.ones((LANES, 6))))) == 0).all()
 
 
 def test_a_nan_lane_of_the_cholesky_is_alone():
     rng = np.random.default_rng(0)
     B = rng.normal(size=(LANES, 6, 9))
     M, rhs = B @ np.swapaxes(B, 1, 2), rng.normal(size=(LANES, 6))
-    clean = np.stack(solve_factored(cholesky(lower_columns(M), TOLERANCE), vector(rhs)))
+    clean = np.stack(cholesky_solve(cholesky(lower_columns(M), TOLERANCE), vector(rhs)))
     M[5] = np.nan
-    dirty = np.stack(solve_factored(cholesky(lower_columns(M), TOLERANCE), vector(rhs)))
+    dirty = np.stack(cholesky_solve(cholesky(lower_columns(M), TOLERANCE), vector(rhs)))
     others = np.arange(LANES) != 5
     np.testing.assert_array_equal(clean[:, others], dirty[:, others])
 
@@ -167,7 +168,9 @@ def run(program, point, tolerance=1e-9, budget=40, skip=None):
 
     @jax.jit
     def go(program, point, skip, tolerance, budget):
-        return solve(program._replace(constant=0.25), begin(program, point, skip), tolerance, budget)
+        return solve_cone_program(
+            program._replace(constant=0.25), begin_cone_program(program, point, skip), tolerance, budget
+        )
 
     return go(program, point, skip, jnp.asarray(tolerance), jnp.int32(budget))
 
@@ -234,9 +237,9 @@ def test_finished_lanes_are_frozen_whole(tile):
 def test_a_finished_lane_keeps_its_iterate_when_solved_again(tile):
     program, point = tile
     end = run(program, point)
-    again = jax.jit(lambda p, s: solve(p._replace(constant=0.25), s, jnp.asarray(1e-14), jnp.int32(5)))(
-        program, end
-    )
+    again = jax.jit(
+        lambda p, s: solve_cone_program(p._replace(constant=0.25), s, jnp.asarray(1e-14), jnp.int32(5))
+    )(program, end)
     assert lane_bits(end, slice(None)) == lane_bits(again, slice(None))
 
 
@@ -254,7 +257,7 @@ def test_budgets_of_nothing_and_of_one_step(tile):
 def test_interrupting_changes_no_bit(tile):
     program, point = tile
     whole = run(program, point, budget=9)
-    step = jax.jit(lambda p, s, n: solve(p._replace(constant=0.25), s, jnp.asarray(1e-9), n))
+    step = jax.jit(lambda p, s, n: solve_cone_program(p._replace(constant=0.25), s, jnp.asarray(1e-9), n))
     half = step(program, run(program, point, budget=4), jnp.int32(5))
     assert lane_bits(whole, slice(None)) == lane_bits(half, slice(None))
 
@@ -291,13 +294,17 @@ def test_an_impossible_tolerance_stalls_on_the_best_iterate(tile):
 
 def test_a_question_stops_the_lanes_it_is_answered_for(tile):
     program, point = tile
-    gap = begin(program, point, jnp.zeros(LANES, bool)).gap
+    gap = begin_cone_program(program, point, jnp.zeros(LANES, bool)).gap
 
     def decided(program, iterate):
         return program.primal_value(iterate.u) - program.dual_value(iterate.y) < 0.1
 
-    state = begin(program, point, jnp.zeros(LANES, bool))
-    go = jax.jit(lambda p, s: solve(p._replace(constant=0.25), s, jnp.asarray(1e-9), jnp.int32(40), decided))
+    state = begin_cone_program(program, point, jnp.zeros(LANES, bool))
+    go = jax.jit(
+        lambda p, s: solve_cone_program(
+            p._replace(constant=0.25), s, jnp.asarray(1e-9), jnp.int32(40), decided
+        )
+    )
     end = go(program, state)
     assert (np.asarray(end.stop) == Stop.DECIDED).all()
     assert (np.asarray(end.gap) < 0.1).all()
@@ -369,7 +376,7 @@ import jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
 import jaxgrasp as jg
-from jaxgrasp.solver import stages
+from jaxgrasp.backend import xla as stages
 from families import random_coefficients, random_contacts
 
 def double(x):

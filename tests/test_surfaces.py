@@ -8,9 +8,9 @@ import trimesh
 from real_data import real_meshes
 from scipy.spatial import KDTree
 
-from jaxgrasp import meshes, objects, surfaces
-from jaxgrasp._types import unit_roundoff
-from jaxgrasp.errors import UserError
+from jaxgrasp import objects, surfaces
+from jaxgrasp.core.errors import UserError
+from jaxgrasp.core.tolerances import unit_roundoff
 from jaxgrasp.surfaces.nearest import point_triangle
 
 AT = (0.01, -0.02, 0.005)
@@ -344,7 +344,7 @@ def test_a_point_and_a_triangle():
 def test_exact_at_metre_scale(name, mug, block):
     """Scaled to metres and moved by ten, near the surface and far from it."""
     small = {"mug": mug, "box": block}[name]
-    mesh = objects.make(name)
+    mesh = objects.make_object(name)
     mesh.apply_scale(10)
     mesh.apply_translation((10.0, -7.0, 3.0))
     surface = surfaces.MeshSurface(mesh, 16) if name == "box" else surfaces.MeshSurface(mesh, 64)
@@ -500,7 +500,7 @@ def test_mesh_samples_are_uniform_and_repeat(mug):
     assert mug.project_exact(point[:500]).distance.max() < 1e-15
     products = normal[:, :, None] * (point - np.asarray(mug.centre))[:, None]
     mean, spread = products.mean(axis=0), products.std(axis=0) / 200
-    wanted = -objects.make("mug").volume / objects.make("mug").area * np.eye(3)
+    wanted = -objects.make_object("mug").volume / objects.make_object("mug").area * np.eye(3)
     assert np.all(np.abs(mean - wanted) < 5 * spread)
     assert mug.sample(7, 40_000)[0].tobytes() == point.tobytes()
     assert mug.sample(7, 0)[0].shape == (0, 3)
@@ -522,7 +522,7 @@ def test_points_far_outside_and_without_numbers(block):
 
 
 def test_an_open_mesh_warns_and_its_rim_is_sharp():
-    mesh = objects.make("sphere")
+    mesh = objects.make_object("sphere")
     mesh.update_faces(mesh.triangles_center[:, 2] < 0.02)
     surface = surfaces.MeshSurface(mesh, 40)
     assert any("not watertight" in w for w in surface.warnings)
@@ -569,7 +569,7 @@ def test_surfaces_of_names_files_and_bodies(tmp_path):
     surface = surfaces.of(path, "mm", com=(0, 0, 0.01), resolution=24)
     assert float(surface.radius) == pytest.approx(np.linalg.norm([0.05, 0.04, 0.04]), rel=1e-6)
     assert np.asarray(surface.centre) == pytest.approx([0, 0, 0.01])
-    body = meshes.load(path, "mm")
+    body = objects.load_mesh(path, "mm")
     assert np.asarray(surfaces.of(body, resolution=24).centre) == pytest.approx([0, 0, 0], abs=1e-9)
     with pytest.raises(ValueError, match="a Body has its unit"):
         surfaces.of(body, "mm")

@@ -10,7 +10,7 @@ import pytest
 from families import random_coefficients, random_contacts
 
 import jaxgrasp as jg
-from jaxgrasp.solver import Stop
+from jaxgrasp.conic.stop import Stop
 
 K = 6
 

@@ -39,11 +39,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from ..errors import UserError
-from ..status import Status
+from ..core import Status, UserError
 from .parquet import ContactFile, Contacts, dump, read_metadata
 
-__all__ = ["COLUMNS", "Forces", "GraspFile", "read_row", "schema", "table"]
+__all__ = ["COLUMNS", "Forces", "GraspFile", "read_force_row", "force_schema", "force_table"]
 
 KEY = b"jaxgrasp"
 COLUMNS = (
@@ -67,7 +66,7 @@ class Forces:
     iterations: np.ndarray
 
 
-def schema(fingers: int, dimension: int, metadata: dict[str, Any]) -> pa.Schema:
+def force_schema(fingers: int, dimension: int, metadata: dict[str, Any]) -> pa.Schema:
     """The columns above for k = ``fingers``."""
     real, vector = pa.float64(), pa.list_(pa.float64(), dimension)
     per_contact, vectors = pa.list_(real, fingers), pa.list_(vector, fingers)
@@ -90,7 +89,7 @@ def _lists(values: np.ndarray, kind: pa.DataType, missing: np.ndarray | None = N
     return pa.ListArray.from_arrays(pa.array(ends), inner.cast(kind.value_type), mask=pa.array(missing))
 
 
-def table(rows: np.ndarray, contacts: Contacts, forces: Forces, kind: pa.Schema) -> pa.Table:
+def force_table(rows: np.ndarray, contacts: Contacts, forces: Forces, kind: pa.Schema) -> pa.Table:
     """One Arrow table of these rows with the columns of ``kind``, nulls where the documentation says so."""
     infeasible = forces.status == Status.INFEASIBLE.value
     unknown = infeasible | (forces.status == Status.INVALID.value)
@@ -191,7 +190,7 @@ def _one(path: Path, number: int, columns: list[str]) -> pa.RecordBatch:
     return found.slice(number, 1).combine_chunks().to_batches()[0]
 
 
-def read_row(path: Path, number: int) -> tuple[dict[str, Any], dict[str, Any]]:
+def read_force_row(path: Path, number: int) -> tuple[dict[str, Any], dict[str, Any]]:
     """Row ``number`` (from 0) of a file of forces, lists as arrays, nulls as None; and the metadata."""
     metadata = read_metadata(path)
     if "load" not in metadata:

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import UserError
-from ..status import Status
-from ..tracing import load_grasp
+from ..core import Status, UserError
+from .grasp_npz import load_grasp
 from .parquet import Contacts
 
 __all__ = ["SavedGrasps"]

@@ -16,7 +16,7 @@ from .rounded import Cylinder, RoundedBox, Sphere
 from .surface import SmoothSurface, Surface
 
 if TYPE_CHECKING:
-    from ..meshes import Body
+    from ..objects import Body
 
 __all__ = [
     "Surface",
@@ -39,12 +39,15 @@ def of(source: str | Path | Body, unit: str = "m", com: Any = None, resolution: 
     com         (3,) centre of mass in m, by default computed from the mesh
     resolution  nodes of the distance grid along the longest side
 
-    What ``jaxgrasp.meshes.load`` found doubtful is in ``warnings`` too. UserError as there and in ``MeshSurface``.
+    What ``jaxgrasp.objects.load_mesh`` found doubtful is in ``warnings`` too. UserError as there and in
+    ``MeshSurface``.
     """
-    from ..meshes import Body, load
+    from ..objects import Body, load_mesh
 
     if isinstance(source, Body):
         if unit != "m" or com is not None:
-            raise ValueError("a Body has its unit and its centre of mass: give those to jaxgrasp.meshes.load")
+            raise ValueError(
+                "a Body has its unit and its centre of mass: give those to jaxgrasp.objects.load_mesh"
+            )
         return MeshSurface.from_body(source, resolution)
-    return MeshSurface.from_body(load(source, unit, com), resolution)
+    return MeshSurface.from_body(load_mesh(source, unit, com), resolution)

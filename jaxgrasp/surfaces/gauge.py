@@ -18,8 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from .._types import Array, Float
-from ..geometry import contact_frame, cross
+from ..core import Array, Float, contact_frame, cross
 from .surface import Surface, centre_or_origin, directions, generator, parameter, same_dtype
 
 __all__ = ["Ellipsoid", "Gauge", "Superquadric"]

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._types import Array, Float, Int
+from ..core import Array, Float, Int
 from .nearest import TriangleSearch, pieces
 from .triangles import Triangles
 

@@ -14,15 +14,14 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .._types import Array, Float
-from ..errors import UserError
+from ..core import Array, Float, UserError
 from .grid import DistanceGrid, distance_grid
 from .nearest import TriangleSearch
 from .surface import SmoothSurface, Surface, generator, unit_or
 from .triangles import Triangles
 
 if TYPE_CHECKING:
-    from ..meshes import Body
+    from ..objects import Body
 
 __all__ = ["GridSurface", "MeshSurface", "NearestPoint"]
 
@@ -98,7 +97,7 @@ class GridSurface(SmoothSurface):
 class MeshSurface(Surface):
     """The surface of a mesh, on which contacts can be moved by gradients and then put exactly.
 
-    mesh        a ``trimesh.Trimesh``, m, outward normals; ``from_body`` takes what ``jaxgrasp.meshes.load`` returns
+    mesh        a ``trimesh.Trimesh``, m, outward normals; ``from_body`` takes a ``Body`` of ``objects.load_mesh``
     resolution  nodes of the grid along the mesh's longest side, 16 or more
     centre      (3,) centre of mass, m; by default that of the volume inside, of the surface where the mesh is open
     crease      rad: an edge is sharp where its faces' normals differ by more; the rim of an open mesh is sharp

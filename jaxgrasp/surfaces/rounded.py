@@ -13,17 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from .._types import Array, Float
-from .surface import (
-    Surface,
-    centre_or_origin,
-    directions,
-    generator,
-    on_host,
-    parameter,
-    same_dtype,
-    unit_or,
-)
+from ..core import Array, Float
+from .surface import Surface, centre_or_origin, directions, generator, on_host, parameter, same_dtype, unit_or
 
 __all__ = ["Cylinder", "RoundedBox", "Sphere"]
 

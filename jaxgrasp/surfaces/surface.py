@@ -17,8 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from .._types import Array, Float
-from ..geometry import contact_frame
+from ..core import Array, Float, contact_frame
 
 __all__ = [
     "SmoothSurface",

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..errors import UserError
+from ..core import UserError
 
 __all__ = ["Triangles"]
 
@@ -91,7 +91,7 @@ class Triangles:
                 raise UserError("the mesh encloses no volume; give it a thickness")
             if volume.sum() < 0:
                 raise UserError(
-                    "the faces point inwards; jaxgrasp.meshes.load turns them, or invert the mesh"
+                    "the faces point inwards; jaxgrasp.objects.load_mesh turns them, or invert the mesh"
                 )
             weight, centroid = volume, (a + b + c) / 4
         else:

@@ -1,0 +1,22 @@
+"""The machine under the numbers: tiles of grasps, devices and precision, and what XLA is asked for."""
+
+from .device import precision, remember_compilations, usable_backend
+from .tiles import batched, in_chunks, in_sweeps, map_selected, map_tiles, tile_width, to_lanes, to_rows
+from .xla import inlined, kernel, stage
+
+__all__ = [
+    "batched",
+    "in_chunks",
+    "in_sweeps",
+    "inlined",
+    "kernel",
+    "map_selected",
+    "map_tiles",
+    "precision",
+    "remember_compilations",
+    "stage",
+    "tile_width",
+    "to_lanes",
+    "to_rows",
+    "usable_backend",
+]

@@ -1,0 +1,58 @@
+"""The optimisation problem: data, and the residuals that define its solution.
+
+    minimise    c_0 + <c, u>   subject to   B u = b,  u in K            (primal)
+    maximise    c_0 + <b, y>   subject to   z = c - B^T y in K          (dual)
+
+K is a product of k second-order cones of dimension d. A solution makes ``optimality`` vanish.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from ..core import Array
+from .cone import Cone, cone_sum, inner, scaled_product
+from .linear import matvec, rmatvec
+
+__all__ = ["ConeProgram"]
+
+
+class ConeProgram(NamedTuple):
+    """One tile of cone programs, lanes on the last axis.
+
+    columns  d arrays (m, k, L): B, split by cone component
+    rhs      m arrays (L,): b
+    cost     d arrays (k, L): c
+    exists   (k, L) of zeros and ones: cones that are padding take no part
+    constant c_0, a number
+    """
+
+    columns: Cone
+    rhs: tuple[Array, ...]
+    cost: Cone
+    exists: Array
+    constant: float = 0.0
+
+    def primal_value(self, u: Cone) -> Array:
+        """``c_0 + <c, u>``."""
+        return self.constant + cone_sum(inner(self.cost, u))
+
+    def dual_value(self, y: tuple[Array, ...]) -> Array:
+        """``c_0 + <b, y>``."""
+        total = self.constant + self.rhs[0] * y[0]
+        for b, v in zip(self.rhs[1:], y[1:], strict=True):
+            total = total + b * v
+        return total
+
+    def slack(self, y: tuple[Array, ...]) -> Cone:
+        """``z = c - B^T y``."""
+        return tuple(c - v for c, v in zip(self.cost, rmatvec(self.columns, y), strict=True))
+
+    def residual(self, u: Cone) -> tuple[Array, ...]:
+        """``b - B u``."""
+        applied = matvec(self.columns, u)
+        return tuple(b - applied[i] for i, b in enumerate(self.rhs))
+
+    def optimality(self, y: tuple[Array, ...], u: Cone) -> tuple[tuple[Array, ...], Cone]:
+        """``(b - B u, u o z)``: zero exactly at a primal-dual solution with u and z in K."""
+        return self.residual(u), scaled_product(u, self.slack(y))

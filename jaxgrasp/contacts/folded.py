@@ -1,0 +1,170 @@
+"""The folded grasp map ``A = G diag(mu, mu, 1, gamma)`` of a tile of grasps, lanes on the last axis."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from ..backend import stage, to_lanes
+from ..conic import Cone, Vector, cone_max, cone_sum
+from ..core import Array, cross_components, frame_components, normalize_components
+from .grasp import Grasp
+from .models import Component
+
+__all__ = ["Contacts", "Folded", "contacts_of", "fold", "unfold"]
+
+
+class Contacts(NamedTuple):
+    """Grasps as rows: position, normal (N, k, dim); friction, torsion, active (N, k)."""
+
+    position: Array
+    normal: Array
+    friction: Array
+    torsion: Array
+    active: Array
+
+
+class Folded(NamedTuple):
+    """The folded grasp map A of a tile, lengths divided by L.
+
+    columns  d arrays (m, k, L): normal column first, then the scaled tangents and spin
+    exists   (k, L) ones and zeros      count   (L,) active contacts
+    length   (L,) L in m                valid   (L,) bool: the numbers are a grasp
+    norm     (L,) Frobenius norm of A   resultant  m arrays (L,): a, the wrench of unit normal forces
+    """
+
+    columns: Cone
+    exists: Array
+    count: Array
+    length: Array
+    valid: Array
+    norm: Array
+    resultant: Vector
+
+
+@stage
+def _screen(
+    position: tuple[Array, ...], normal: tuple[Array, ...], friction: Array, torsion: Array, active: Array
+) -> tuple[Array, Array]:
+    """Which lanes are grasps, and which of their contacts count; coordinates and coefficients (k, L)."""
+    usable = jnp.isfinite(friction) & jnp.isfinite(torsion) & (friction >= 0) & (torsion >= 0)
+    points = jnp.zeros_like(usable)
+    for x in normal:
+        points = points | (x != 0)
+    for x in (*position, *normal):
+        usable = usable & jnp.isfinite(x)
+    sound = (usable & points) | ~active
+    valid, some = sound[0], active[0]
+    for i in range(1, active.shape[0]):
+        valid, some = valid & sound[i], some | active[i]
+    valid = valid & some
+    return valid, active & valid
+
+
+@stage
+def _length(position: tuple[Array, ...]) -> Array:
+    square = position[0] * position[0]
+    for x in position[1:]:
+        square = square + x * x
+    largest = jnp.sqrt(cone_max(square))
+    return jnp.where(largest > 0, largest, jnp.ones_like(largest))
+
+
+@stage
+def _unit(normal: tuple[Array, ...]) -> tuple[Array, ...]:
+    return normalize_components(normal)
+
+
+@stage
+def _column(point: tuple[Array, ...], direction: tuple[Array, ...], factor: Array) -> Array:
+    return jnp.stack([factor * x for x in (*direction, *cross_components(point, direction))])
+
+
+@stage
+def _spin_column(normal: tuple[Array, ...], factor: Array) -> Array:
+    return jnp.stack([*(jnp.zeros_like(x) for x in normal), *(factor * x for x in normal)])
+
+
+@stage
+def _resultant(normal_column: Array) -> Vector:
+    return tuple(cone_sum(normal_column[i]) for i in range(normal_column.shape[0]))
+
+
+@stage
+def _frobenius(columns: Cone) -> Array:
+    total = None
+    for c in columns:
+        for i in range(c.shape[0]):
+            part = cone_sum(c[i] * c[i])
+            total = part if total is None else total + part
+    assert total is not None
+    return jnp.sqrt(total)
+
+
+def fold(contacts: Contacts, components: tuple[Component, ...], length: Array | None = None) -> Folded:
+    """A of a tile of L rows. Contacts that do not count get zero columns; invalid lanes are all zero.
+
+    ``length`` (L,) is what lengths are divided by, by default the largest distance of a contact from the origin.
+    """
+    position, normal = to_lanes(contacts.position), to_lanes(contacts.normal)
+    friction, torsion, active = (
+        to_lanes(contacts.friction),
+        to_lanes(contacts.torsion),
+        to_lanes(contacts.active),
+    )
+    dtype, dimension = position.dtype, position.shape[1]
+    coordinates = (
+        tuple(position[:, i] for i in range(dimension)),
+        tuple(normal[:, i] for i in range(dimension)),
+    )
+    valid, live = _screen(*coordinates, friction, torsion, active)
+    exists = live.astype(dtype)
+    point = tuple(jnp.where(live, position[:, i], jnp.zeros_like(position[:, i])) for i in range(dimension))
+    length = _length(point) if length is None else length
+    point = tuple(x / length for x in point)
+    last = [jnp.zeros((), dtype)] * (dimension - 1) + [jnp.ones((), dtype)]
+    direction = _unit(tuple(jnp.where(live, normal[:, i], last[i]) for i in range(dimension)))
+    frames = frame_components(direction)
+
+    mu = jnp.where(live, friction, jnp.zeros_like(friction))
+    gamma = jnp.where(live, torsion, jnp.zeros_like(torsion)) / length
+    columns = [_column(point, direction, exists)]
+    for component in components:
+        if component is Component.SPIN:
+            columns.append(_spin_column(direction, gamma))
+        elif component is not Component.NORMAL:
+            columns.append(_column(point, frames[0 if component is Component.TANGENT_1 else 1], mu))
+    return Folded(
+        tuple(columns),
+        exists,
+        jnp.maximum(cone_sum(exists), jnp.ones_like(length)),
+        length,
+        valid,
+        _frobenius(tuple(columns)),
+        _resultant(columns[0]),
+    )
+
+
+def contacts_of(grasp: Grasp) -> Contacts:
+    """The arrays the lanes are made of."""
+    return Contacts(
+        grasp.position,
+        grasp.normal,
+        grasp.model.friction_coefficient,
+        grasp.model.torsion_coefficient,
+        grasp.active,
+    )
+
+
+def unfold(s: Cone, components: tuple[Component, ...], friction: Array, torsion: Array) -> Array:
+    """``f = (mu s_1, mu s_2, s_0, gamma s_3)`` per contact in the chapter's order, flattened to (k n, L)."""
+    tangential = iter(s[1:])
+    parts = []
+    for component in components:
+        if component is Component.NORMAL:
+            parts.append(s[0])
+        else:
+            parts.append((torsion if component is Component.SPIN else friction) * next(tangential))
+    stacked = jnp.stack(parts, axis=1)
+    return stacked.reshape(-1, stacked.shape[-1])

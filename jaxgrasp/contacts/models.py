@@ -1,0 +1,260 @@
+"""Contact models: objects that answer questions about the forces a contact can transmit.
+
+Every model is one unit second-order cone after scaling (mu and gamma fold into the grasp map's columns),
+
+    psi(f) = |(f_x / mu, f_y / mu, tau_n / gamma)| <= f_n,
+
+so frictionless, hard and soft contacts may share one grasp: a soft finger with gamma = 0 is a hard one, with
+mu = gamma = 0 a frictionless one. Forces are in N, torques in N m, mu has no unit, gamma is a length in m.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from enum import Enum
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from ..core import Array, Float, real_array
+
+__all__ = ["Component", "ContactModel", "Frictionless", "HardFinger", "MODELS", "SoftFinger"]
+
+
+class Component(Enum):
+    """One coordinate of a contact force."""
+
+    TANGENT_1 = "f_x"
+    TANGENT_2 = "f_y"
+    NORMAL = "f_n"
+    SPIN = "tau_n"
+
+
+class ContactModel(eqx.Module):
+    """The questions a contact answers. Subclasses state components and coefficients; the rest follows."""
+
+    @abstractmethod
+    def components(self, dimension: int) -> tuple[Component, ...]:
+        """Force components in the chapter's order, for a body in ``dimension`` 2 or 3."""
+
+    @property
+    @abstractmethod
+    def friction_coefficient(self) -> Array:
+        """mu of (11.3), per contact."""
+
+    @property
+    @abstractmethod
+    def torsion_coefficient(self) -> Array:
+        """gamma of (11.34) in m, per contact."""
+
+    @abstractmethod
+    def with_coefficients(self, friction: Array, torsion: Array) -> ContactModel:
+        """The same model with other coefficients."""
+
+    @abstractmethod
+    def lmi_matrices(self, dimension: int) -> Float[Array, "*contacts n q q"]:
+        """The S_j of ``P(f) = sum_j f_j S_j >= 0`` (11.9), one stack per contact."""
+
+    @abstractmethod
+    def log_det_terms(self, dimension: int) -> tuple[Array, Array, Array]:
+        """(a, b, c), per contact, of ``log det P(f) = a log f_n + b log(f_n^2 - psi^2) + c`` for (11.4), (11.35).
+
+        Wherever mu = 0, P is the scalar f_n: a = 1, b = c = 0.
+        """
+
+    def force_size(self, dimension: int) -> int:
+        """n, the number of force components of one contact."""
+        return len(self.components(dimension))
+
+    def normal_index(self, dimension: int) -> int:
+        """Position of f_n among the components."""
+        return self.components(dimension).index(Component.NORMAL)
+
+    def scaling(self, dimension: int) -> Float[Array, "*contacts n"]:
+        """``(mu, mu, 1, gamma)`` in the order of the components: f_j = scaling_j s_j, s in the unit cone."""
+        mu, gamma = self.friction_coefficient, self.torsion_coefficient
+        by_component = {
+            Component.TANGENT_1: mu,
+            Component.TANGENT_2: mu,
+            Component.NORMAL: jnp.ones_like(mu),
+            Component.SPIN: gamma,
+        }
+        return jnp.stack([by_component[c] for c in self.components(dimension)], axis=-1)
+
+    def friction_function(
+        self, force: Float[Array, "*contacts n"], dimension: int
+    ) -> Float[Array, "*contacts"]:
+        """``psi(f) = |(f_x / mu, f_y / mu, tau_n / gamma)|`` in N; the force is feasible iff psi(f) <= f_n.
+
+        Infinite where a component is not zero but its coefficient is.
+        """
+        scale = self.scaling(dimension)
+        ratio = jnp.where(force == 0, 0.0, force / jnp.where(scale > 0, scale, 1.0))
+        ratio = jnp.where((scale <= 0) & (force != 0), jnp.inf, ratio)
+        tangential = jnp.delete(ratio, self.normal_index(dimension), axis=-1)
+        return jnp.sqrt(jnp.sum(tangential * tangential, axis=-1))
+
+    def feasibility_slack(
+        self, force: Float[Array, "*contacts n"], dimension: int
+    ) -> Float[Array, "*contacts"]:
+        """``f_n - psi(f)`` in N: positive inside the friction cone."""
+        return force[..., self.normal_index(dimension)] - self.friction_function(force, dimension)
+
+    def dual_slack(self, velocity: Float[Array, "*contacts n"], dimension: int) -> Float[Array, "*contacts"]:
+        """``x_n - |(mu x_x, mu x_y, gamma x_tau)|``: at least 0 iff no feasible force does negative work.
+
+        ``velocity`` is ``G_i^T xi``, the contact's velocity in its own frame (m/s, rad/s).
+        """
+        scaled = velocity * self.scaling(dimension)
+        tangential = jnp.delete(scaled, self.normal_index(dimension), axis=-1)
+        normal = velocity[..., self.normal_index(dimension)]
+        return normal - jnp.sqrt(jnp.sum(tangential * tangential, axis=-1))
+
+
+def _symmetric_unit(size: int, row: int, column: int, dtype) -> Array:
+    unit = jnp.zeros((size, size), dtype).at[row, column].set(1.0)
+    return unit.at[column, row].set(1.0)
+
+
+def _arrow_matrices(
+    coefficients: list[Array], diagonal: Array, normal_index: int
+) -> Float[Array, "*contacts n q q"]:
+    """S_j of the arrow matrix ``diagonal * f_n I + sum_j coefficient_j f_j (e_j e_q^T + e_q e_j^T)``."""
+    size = len(coefficients) + 1
+    matrices = [
+        c[..., None, None] * _symmetric_unit(size, j, size - 1, c.dtype) for j, c in enumerate(coefficients)
+    ]
+    matrices.insert(normal_index, diagonal[..., None, None] * jnp.eye(size, dtype=diagonal.dtype))
+    return jnp.stack(matrices, axis=-3)
+
+
+def _where_rough(friction: Array, value: float, otherwise: float) -> Array:
+    return jnp.where(friction > 0, jnp.full_like(friction, value), jnp.full_like(friction, otherwise))
+
+
+class Frictionless(ContactModel):
+    """Frictionless point contact: ``f = (f_n)``, ``f_n >= 0``, ``P(f) = f_n``."""
+
+    zero: Array
+
+    def __init__(self, zero: Any = 0.0):  # zeros in the shape of the contacts
+        self.zero = real_array(zero, "the placeholder")
+
+    def components(self, dimension: int) -> tuple[Component, ...]:
+        return (Component.NORMAL,)
+
+    @property
+    def friction_coefficient(self) -> Array:
+        return jnp.zeros_like(self.zero)
+
+    @property
+    def torsion_coefficient(self) -> Array:
+        return jnp.zeros_like(self.zero)
+
+    def with_coefficients(self, friction: Array, torsion: Array) -> Frictionless:
+        return Frictionless(jnp.zeros_like(friction))
+
+    def lmi_matrices(self, dimension: int) -> Float[Array, "*contacts 1 1 1"]:
+        return jnp.ones((*self.zero.shape, 1, 1, 1), self.zero.dtype)
+
+    def log_det_terms(self, dimension: int) -> tuple[Array, Array, Array]:
+        zero = jnp.zeros_like(self.zero)
+        return zero + 1, zero, zero
+
+
+class HardFinger(ContactModel):
+    """Hard point contact with Coulomb friction (11.3): ``|(f_x, f_y)| <= mu f_n``.
+
+    ``friction`` is mu >= 0: a number, or one per contact. In the plane the force is ``(f_t, f_n)``.
+    """
+
+    friction: Array
+
+    def __init__(self, friction: Any = 0.5):
+        self.friction = real_array(friction, "friction")
+
+    def components(self, dimension: int) -> tuple[Component, ...]:
+        if dimension == 2:
+            return (Component.TANGENT_1, Component.NORMAL)
+        return (Component.TANGENT_1, Component.TANGENT_2, Component.NORMAL)
+
+    @property
+    def friction_coefficient(self) -> Array:
+        return self.friction
+
+    @property
+    def torsion_coefficient(self) -> Array:
+        return jnp.zeros_like(self.friction)
+
+    def with_coefficients(self, friction: Array, torsion: Array) -> HardFinger:
+        return HardFinger(friction)
+
+    def lmi_matrices(self, dimension: int) -> Float[Array, "*contacts n q q"]:
+        """(11.4): ``[[mu f_n, 0, f_x], [0, mu f_n, f_y], [f_x, f_y, mu f_n]]``; its 2 x 2 form in the plane.
+
+        lambda_min = mu (f_n - psi). Where mu = 0 there is no tangential force and P = f_n I.
+        """
+        mu = self.friction
+        tangent = jnp.where(mu > 0, jnp.ones_like(mu), jnp.zeros_like(mu))
+        diagonal = jnp.where(mu > 0, mu, jnp.ones_like(mu))
+        return _arrow_matrices([tangent] * (dimension - 1), diagonal, self.normal_index(dimension))
+
+    def log_det_terms(self, dimension: int) -> tuple[Array, Array, Array]:
+        """``dimension log mu + (dimension - 2) log f_n + log(f_n^2 - psi^2)``."""
+        mu = self.friction
+        safe = jnp.where(mu > 0, mu, jnp.ones_like(mu))
+        return _where_rough(mu, dimension - 2, 1), _where_rough(mu, 1, 0), dimension * jnp.log(safe)
+
+
+class SoftFinger(ContactModel):
+    """Soft finger, elliptic model (11.34): ``(f_x^2 + f_y^2) / mu^2 + tau_n^2 / gamma^2 <= f_n^2``.
+
+    ``friction`` is mu >= 0, ``torsion`` is gamma >= 0 in m (the largest torque is gamma f_n); numbers, or one
+    per contact. A planar soft finger does not exist.
+    """
+
+    friction: Array
+    torsion: Array
+
+    def __init__(self, friction: Any = 0.5, torsion: Any = 0.01):
+        self.friction = real_array(friction, "friction")
+        self.torsion = real_array(torsion, "torsion")
+
+    def components(self, dimension: int) -> tuple[Component, ...]:
+        if dimension == 2:
+            raise ValueError(
+                "a planar soft finger does not exist: torsion acts about the normal, which lies in the "
+                "plane. Use HardFinger for planar grasps, or 3-D positions."
+            )
+        return (Component.TANGENT_1, Component.TANGENT_2, Component.NORMAL, Component.SPIN)
+
+    @property
+    def friction_coefficient(self) -> Array:
+        return self.friction
+
+    @property
+    def torsion_coefficient(self) -> Array:
+        return self.torsion
+
+    def with_coefficients(self, friction: Array, torsion: Array) -> SoftFinger:
+        return SoftFinger(friction, torsion)
+
+    def lmi_matrices(self, dimension: int) -> Float[Array, "*contacts 4 4 4"]:
+        """(11.35): ``f_n I`` with ``f_x / mu, f_y / mu, tau_n / gamma`` in the last row and column.
+
+        lambda_min = f_n - psi. A component whose coefficient is 0 does not exist; its S_j is 0.
+        """
+        inverses = [
+            jnp.where(c > 0, 1 / jnp.where(c > 0, c, 1.0), 0.0)
+            for c in (self.friction, self.friction, self.torsion)
+        ]
+        return _arrow_matrices(inverses, jnp.ones_like(self.friction), self.normal_index(dimension))
+
+    def log_det_terms(self, dimension: int) -> tuple[Array, Array, Array]:
+        """``2 log f_n + log(f_n^2 - psi^2)``."""
+        mu = self.friction
+        return _where_rough(mu, 2, 1), _where_rough(mu, 1, 0), jnp.zeros_like(mu)
+
+
+MODELS = {"hard": HardFinger, "soft": SoftFinger, "frictionless": Frictionless}

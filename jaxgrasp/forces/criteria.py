@@ -1,0 +1,176 @@
+"""What makes one set of contact forces better than another (section 11.3): convex costs that carry their weights.
+
+f_n,i is the normal force of contact i in N, P_i the matrix of its friction LMI (11.4), (11.35). A criterion states its
+cost as the pieces a cone program is made of:
+
+    level       the largest normal force xi counts, once                  (gentlest, robust)
+    price       each normal force counts by itself                        (smallest sum)
+    curvature   each squared component counts                             (sum of squares, least norm)
+    barrier     -log det P_i counts                                       (robust)
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from ..contacts import Component, Grasp
+from ..core import Array, Float
+
+__all__ = ["Criterion", "Gentlest", "LeastNorm", "Robust", "SmallestSum", "SumOfSquares"]
+
+
+def _by_contact(grasp: Grasp, force: Array) -> Array:
+    n = grasp.model.force_size(grasp.dimension)
+    return force.reshape(*force.shape[:-1], force.shape[-1] // n, n)
+
+
+def _normal_forces(grasp: Grasp, force: Array) -> Array:
+    normal = _by_contact(grasp, force)[..., grasp.model.normal_index(grasp.dimension)]
+    return jnp.where(grasp.active, normal, jnp.zeros_like(normal))
+
+
+class Criterion(eqx.Module):
+    """A convex cost of contact forces. ``criterion.cost(grasp, force)`` is its definition."""
+
+    @property
+    def level(self) -> bool:
+        """Whether the largest normal force is part of the cost."""
+        return False
+
+    @property
+    def price(self) -> bool:
+        """Whether the sum of the normal forces is the cost."""
+        return False
+
+    def curvature(self, component: Component, friction: Array, torsion: Array) -> Array | None:
+        """c in ``c s^2``, the cost of a scaled component s (f = mu s, gamma s or s); None: no such cost."""
+        return None
+
+    @property
+    def barrier_weight(self) -> Array | None:
+        """N for each unit of -log det P; None where the barrier is no part of the cost."""
+        return None
+
+    @abstractmethod
+    def cost(self, grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch"]:
+        """The cost of ``force`` (chapter's component order), whether it is feasible or not."""
+
+
+class Gentlest(Criterion):
+    """``max_i f_n,i`` in N: the least pressure on the object (11.3, gentlest grasp criterion)."""
+
+    @property
+    def level(self) -> bool:
+        return True
+
+    def cost(self, grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch"]:
+        normal = _normal_forces(grasp, force)
+        return jnp.max(jnp.where(grasp.active, normal, -jnp.inf), axis=-1)
+
+
+class Robust(Criterion):
+    """``max_i f_n,i - weight * sum_i log det P_i(f_i)``: gentle, but away from the edge of friction (11.3, robust).
+
+    ``weight`` in N (default 1). P_i is (11.4) for hard fingers, ``[[mu f_n, f_t], [f_t, mu f_n]]`` in the plane,
+    (11.35) for soft fingers, the scalar f_n for frictionless contacts and wherever mu = 0; forces in N under the
+    logarithm. The cost is in N up to the constant that a change of the unit under the logarithm adds.
+    """
+
+    weight: Array
+
+    def __init__(self, weight: Any = 1.0):
+        self.weight = _positive(weight, "weight")
+
+    @property
+    def level(self) -> bool:
+        return True
+
+    @property
+    def barrier_weight(self) -> Array | None:
+        return self.weight
+
+    def cost(self, grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch"]:
+        normal = _normal_forces(grasp, force)
+        top = jnp.max(jnp.where(grasp.active, normal, -jnp.inf), axis=-1)
+        on_normal, on_cone, constant = grasp.model.log_det_terms(grasp.dimension)
+        psi = grasp.model.friction_function(_by_contact(grasp, force), grasp.dimension)
+        inside = grasp.active & (normal > 0) & ((psi < normal) | (on_cone == 0))
+        safe = jnp.where(inside, normal, 1.0)
+        counted = inside & (on_cone > 0)
+        room = jnp.where(counted, (safe - psi) * (safe + psi), 1.0)
+        log_det = on_normal * jnp.log(safe) + on_cone * jnp.log(room) + constant
+        log_det = jnp.where(inside, log_det, jnp.where(grasp.active, -jnp.inf, 0.0))
+        return top - self.weight.astype(top.dtype) * jnp.sum(log_det, axis=-1)
+
+
+class SmallestSum(Criterion):
+    """``sum_i f_n,i`` in N: the least total squeeze (11.3, smallest sum of normal forces criterion)."""
+
+    @property
+    def price(self) -> bool:
+        return True
+
+    def cost(self, grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch"]:
+        return jnp.sum(_normal_forces(grasp, force), axis=-1)
+
+
+class SumOfSquares(Criterion):
+    """``sum_i f_n,i^2`` in N^2: evenly shared normal forces (11.3, sum of squared normal forces)."""
+
+    def curvature(self, component: Component, friction: Array, torsion: Array) -> Array | None:
+        return jnp.ones_like(friction) if component is Component.NORMAL else jnp.zeros_like(friction)
+
+    def cost(self, grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch"]:
+        normal = _normal_forces(grasp, force)
+        return jnp.sum(normal * normal, axis=-1)
+
+
+class LeastNorm(Criterion):
+    """``sum_i |f_i|^2`` in N^2, torques over a length: the least Euclidean norm of all contact forces (11.3).
+
+    A soft finger's torque counts as ``(tau_n / length)^2``. ``length`` in m, a number or one per grasp; by default
+    gamma of each contact, which weighs the largest torque like the normal force it comes from.
+    """
+
+    length: Array | None
+
+    def __init__(self, length: Any = None):
+        self.length = None if length is None else _positive(length, "length")
+
+    def curvature(self, component: Component, friction: Array, torsion: Array) -> Array | None:
+        if component is Component.NORMAL:
+            return jnp.ones_like(friction)
+        if component is not Component.SPIN:
+            return friction * friction
+        if self.length is None:
+            return jnp.ones_like(torsion)
+        ratio = torsion / self.length.astype(torsion.dtype)
+        return ratio * ratio
+
+    def cost(self, grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch"]:
+        parts = _by_contact(grasp, force)
+        total = jnp.zeros(parts.shape[:-1], parts.dtype)
+        gamma = grasp.model.torsion_coefficient
+        for j, component in enumerate(grasp.model.components(grasp.dimension)):
+            value = parts[..., j]
+            if component is Component.SPIN:
+                if self.length is None:
+                    length = jnp.where(gamma > 0, gamma, 1.0)
+                else:
+                    length = self.length.astype(parts.dtype)[..., None]
+                value = value / length
+            total = total + value * value
+        return jnp.sum(jnp.where(grasp.active, total, 0.0), axis=-1)
+
+
+def _positive(value: Any, name: str) -> Array:
+    array = jnp.asarray(value)
+    if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
+        raise ValueError(f"{name} must be a positive number, or one per grasp, got {value!r}")
+    if isinstance(value, int | float) and not value > 0:
+        raise ValueError(f"{name} must be positive, got {value}")
+    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.result_type(float))

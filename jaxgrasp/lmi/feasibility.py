@@ -1,0 +1,208 @@
+"""Second-order cones as LMIs (11.12); whether an LMI has a solution, with a proof either way (Definition 4,
+feasibility); the semidefinite program in dual form (Definition 6). The method is that of barrier.py."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ..core import Array, Bool, Float, rounding_constant, unit_roundoff
+from .barrier import gap_goal, lmi_minimize, minimize
+from .problem import LMIProblem, expect_shape, over_batch
+
+__all__ = [
+    "LMIFeasibility",
+    "SDPSolution",
+    "feasibility",
+    "lmi_feasibility",
+    "sdp_minimize",
+    "second_order_cone_lmi",
+]
+
+
+# Second-order cones ------------------------------------------------------------------------------------
+
+
+def second_order_cone_lmi(
+    A: Float[Array, "*batch a N"],
+    b: Float[Array, "*batch a"],
+    c: Float[Array, "*batch N"],
+    d: Float[Array, "*batch"],
+) -> tuple[Float[Array, "*batch q q"], Float[Array, "*batch N q q"]]:
+    """``|A x + b| <= c.x + d  iff  [[(c.x + d) I, A x + b], [(A x + b)^T, c.x + d]] >= 0`` (11.11)-(11.12).
+
+    Returns Q_0 (*batch, q, q) and Q_1 .. Q_N (*batch, N, q, q), q = a + 1. The lower right entry is the
+    scalar c.x + d (erratum 12: not a second multiple of I).
+    """
+    A, b, c, d = (jnp.asarray(value) for value in (A, b, c, d))
+    expect_shape(A.ndim >= 2, "A", "(*batch, a, N)", A)
+    rows, columns = A.shape[-2:]
+    expect_shape(b.shape[-1:] == (rows,), "b", f"(*batch, {rows})", b)
+    expect_shape(c.shape[-1:] == (columns,), "c", f"(*batch, {columns})", c)
+    stacked = jnp.concatenate(
+        [b[..., None], A], axis=-1
+    )  # column 0: the constant part; column i: that of x_i
+    heights = jnp.concatenate([d[..., None], c], axis=-1)
+    arrows = jnp.zeros((rows, rows + 1, rows + 1), A.dtype)
+    index = jnp.arange(rows)
+    arrows = arrows.at[index, index, rows].set(1.0).at[index, rows, index].set(1.0)
+    Q = jnp.einsum("...ai,apr->...ipr", stacked, arrows)
+    Q = Q + heights[..., None, None] * jnp.eye(rows + 1, dtype=A.dtype)
+    return Q[..., 0, :, :], Q[..., 1:, :, :]
+
+
+# The LMI feasibility problem (Definition 4) ------------------------------------------------------------
+
+
+class LMIFeasibility(eqx.Module):
+    """Answer to: is there an x with Q(x) > 0, or at least with Q(x) >= 0? One of three, and each a proof:
+
+    feasible    (*batch)        Q(x) > 0 at ``x``
+    infeasible  (*batch)        no x with Q(x) >= 0: ``certificate`` proves it as far as ``reach``
+    edge        (*batch)        neither, and s* <= tolerance: no Q(x) > 0 of that depth; Q(x) >= 0 remains open
+
+    x            (*batch, N)     strictly feasible where ``feasible``
+    depth        (*batch)        a lower bound on the normalised depth s*; s* > 0 iff the strict LMI has a solution
+    gap          (*batch)        s* lies in [depth, depth + gap]
+    certificate  (*batch, q, q)  Z >= 0 with tr Z = 1, and where ``infeasible`` ``tr(Q_i Z) = 0``, ``tr(Q_0 Z) < 0``
+    reach        (*batch)        Z excludes every x with ``|x_i| |Q_i| < reach |Q_0|`` as a vector, no unit; 0: none
+
+    All three are False where the numbers are not finite or the solver stopped early.
+    """
+
+    x: Float[Array, "*batch N"]
+    depth: Float[Array, "*batch"]
+    gap: Float[Array, "*batch"]
+    feasible: Bool[Array, "*batch"]
+    infeasible: Bool[Array, "*batch"]
+    edge: Bool[Array, "*batch"]
+    certificate: Float[Array, "*batch q q"]
+    reach: Float[Array, "*batch"]
+
+
+@eqx.filter_jit
+def lmi_feasibility(
+    constant: Float[Array, "*batch q q"], matrices: Float[Array, "*batch N q q"], tolerance: float = 1e-8
+) -> LMIFeasibility:
+    """``s* = max s  subject to  x_0 Q_0 + sum_i x_i Q_i >= s I,  x_0 >= s,  |(x_0, x)| <= 1``: strictly feasible
+    iff s* > 0.
+
+    Every Q_i is first divided by its Frobenius norm, so that no answer depends on units. This is (11.17) with s = -eta
+    and the normalisation it lacks: ``min eta`` alone is homogeneous, so its value would be 0 or -infinity (erratum 1),
+    and ``Q(x) >= 0`` alone is met by x = 0 in (11.15). The point returned is x / x_0.
+
+    The multiplier Z of the matrix block answers the rest. ``Z >= 0`` with ``tr(Q_i Z) = 0`` and ``tr(Q_0 Z) < 0``
+    makes ``tr(Q(x) Z) < 0`` for every x, so Q(x) >= 0 has no solution. In floating point the traces are zero up to
+    some rho, and Z excludes every x with ``|x| < -tr(Q_0 Z) / rho``; the answer is ``infeasible`` where this reach is
+    at least 1 / tolerance. An LMI that has solutions only as x grows without bound, or none but almost (``[[x, 1],
+    [1, 0]]``), is at the edge. Wrong shapes raise ValueError.
+    """
+    N, q = matrices.shape[-3], constant.shape[-1]
+    expect_shape(constant.shape[-2:] == (q, q), "constant", "(*batch, q, q)", constant)
+    expect_shape(matrices.shape[-3:] == (N, q, q), "matrices", f"(*batch, N, {q}, {q})", matrices)
+    goal = gap_goal(tolerance, matrices.dtype)
+
+    def one(problem: tuple[Array, Array]) -> LMIFeasibility:
+        return feasibility(problem[0], problem[1], goal)
+
+    return over_batch(one, (constant, matrices), (2, 3))
+
+
+def _unit(matrices: Array) -> tuple[Array, Array]:
+    """The matrices over their Frobenius norms, and the norms; zero matrices as they are, over 1."""
+    size = jnp.sqrt(jnp.sum(matrices * matrices, axis=(-2, -1)))
+    size = jnp.where(size == 0, 1.0, size)
+    return matrices / size[..., None, None], size
+
+
+def feasibility(constant: Array, matrices: Array, goal: Array) -> LMIFeasibility:
+    """One problem, no batch axes."""
+    N, q, dtype = matrices.shape[0], constant.shape[-1], matrices.dtype
+    scaled, sizes = _unit(jnp.concatenate([constant[None], matrices]))
+    # Variables (x_0, x_1 .. x_N, s); blocks: the LMI, x_0 - s, the unit ball.
+    ball_constant, ball = second_order_cone_lmi(
+        jnp.eye(N + 1, N + 2, dtype=dtype),
+        jnp.zeros(N + 1, dtype),
+        jnp.zeros(N + 2, dtype),
+        jnp.ones((), dtype),
+    )
+    lmi = jnp.concatenate([scaled, -jnp.eye(q, dtype=dtype)[None]])  # (N + 2, q, q)
+    height = jnp.zeros((N + 2, 1, 1), dtype).at[0].set(1.0).at[-1].set(-1.0)
+    blocks = jax.vmap(jax.scipy.linalg.block_diag)(lmi, height, ball)
+    centre = jax.scipy.linalg.block_diag(jnp.zeros((q + 1, q + 1), dtype), ball_constant)
+    down = jnp.zeros(N + 2, dtype).at[-1].set(-1.0)
+    end = minimize(LMIProblem(down, centre, blocks, down), goal)
+
+    depth = -end.value
+    rounding = rounding_constant() * q * unit_roundoff(dtype)
+    feasible = depth > rounding
+    Z = end.dual[:q, :q]
+    total = jnp.trace(Z)
+    Z = Z / jnp.where(total > 0, total, 1.0)
+    traces = jnp.einsum("iab,ab->i", scaled, Z)
+    leak = jnp.sqrt(jnp.sum(traces[1:] ** 2)) + rounding
+    reach = jnp.maximum(-traces[0] - rounding, 0.0) / leak
+    infeasible = ~feasible & (reach * goal >= 1)
+    edge = ~feasible & ~infeasible & (depth + end.gap <= goal)
+    x = end.x[1:-1] / end.x[0] * sizes[0] / sizes[1:]
+    return LMIFeasibility(x, depth, end.gap, feasible, infeasible, edge, Z, reach)
+
+
+# The semidefinite program in dual form (Definition 6) --------------------------------------------------
+
+
+class SDPSolution(eqx.Module):
+    """A primal and a dual point of an SDP; the optimum lies in [bound, value].
+
+    x          (*batch, N)     strictly feasible; NaN where no strictly feasible point was found
+    value      (*batch)        u.x; inf where infeasible, NaN at the edge of feasibility
+    Z          (*batch, q, q)  Z >= 0 with ``tr(S_i Z) = u_i``; where infeasible, the certificate: ``tr(S_i Z) = 0``,
+                               ``tr(S_0 Z) < 0``
+    gap        (*batch)        value - bound >= 0; inf where no dual point was found, as when u.x is unbounded
+    converged  (*batch)        whether the gap met ``tolerance * max(1, |value|)``
+    feasibility                the answer of phase one
+    """
+
+    x: Float[Array, "*batch N"]
+    value: Float[Array, "*batch"]
+    Z: Float[Array, "*batch q q"]
+    gap: Float[Array, "*batch"]
+    converged: Bool[Array, "*batch"]
+    feasibility: LMIFeasibility
+
+    @property
+    def bound(self) -> Float[Array, "*batch"]:
+        """``-tr(S_0 Z)``: no feasible x costs less."""
+        return jnp.where(jnp.isinf(self.value), self.value, self.value - self.gap)
+
+
+@eqx.filter_jit
+def sdp_minimize(
+    u: Float[Array, "*batch N"],
+    constant: Float[Array, "*batch q q"],
+    matrices: Float[Array, "*batch N q q"],
+    tolerance: float = 1e-8,
+) -> SDPSolution:
+    """``min u.x  subject to  S_0 + sum_i x_i S_i >= 0``, with ``max -tr(S_0 Z)`` s.t. ``tr(S_i Z) = u_i, Z >= 0``.
+
+    The semidefinite program in dual form of Definition 6. ``constant`` is S_0, ``matrices`` are S_1 .. S_N: any
+    symmetric matrices (erratum 3: they need not be positive semidefinite). ``lmi_feasibility`` finds the start;
+    ``lmi_minimize`` takes it from there. Wrong shapes raise ValueError.
+    """
+    N, q = u.shape[-1], constant.shape[-1]
+    expect_shape(constant.shape[-2:] == (q, q), "constant", "(*batch, q, q)", constant)
+    expect_shape(matrices.shape[-3:] == (N, q, q), "matrices", f"(*batch, {N}, {q}, {q})", matrices)
+    phase = lmi_feasibility(constant, matrices, tolerance)
+    start = jnp.where(phase.feasible[..., None], phase.x, jnp.nan)
+    end = lmi_minimize(LMIProblem(u, constant, matrices, start), tolerance)
+    infeasible = phase.infeasible
+    batch = end.value.shape
+    return SDPSolution(
+        x=end.x,
+        value=jnp.where(infeasible, jnp.inf, end.value),
+        Z=jnp.where(jnp.broadcast_to(infeasible, batch)[..., None, None], phase.certificate, end.dual),
+        gap=jnp.where(infeasible, 0.0, end.gap),
+        converged=end.converged,
+        feasibility=phase,
+    )

@@ -1,0 +1,185 @@
+"""Closed loops: thousands of grasped objects under a controller and disturbances, all steps in one call."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ..contacts import Grasp, cone_use, grasp_map
+from ..core import Array, Float, Int, applied, real_array, rotate_wrench, wrench_dimension
+from .computed_torque import ContactController, ControlStatus, Reference, tracking_error
+from .mujoco import MujocoPlant
+from .rigid_body import BodyState, RigidBody, advance
+
+__all__ = ["ClosedLoop", "close_loop"]
+
+
+class ClosedLoop(eqx.Module):
+    """What happened, steps first: all of it is (T, *batch).
+
+    status          int32, a ``ControlStatus`` for each step
+    position_error  m, ``|p - p_d|`` before the step; orientation_error: rad, ``|log(R R_d^T)|``
+    cone_use        ``max_i psi_i / f_n,i`` of the applied forces: 1 at the edge of friction
+    largest_normal  N, of the applied forces
+    final           ``BodyState`` after the last step, (*batch)
+    states, force   every state before its step, every applied force (T, *batch, ..); None unless ``record``
+    """
+
+    status: Int[Array, "*lead"]
+    position_error: Float[Array, "*lead"]
+    orientation_error: Float[Array, "*lead"]
+    cone_use: Float[Array, "*lead"]
+    largest_normal: Float[Array, "*lead"]
+    final: BodyState
+    states: BodyState | None
+    force: Float[Array, "*lead kn"] | None
+
+    @property
+    def infeasible(self) -> Array:
+        """(*batch) bool: some step had no admissible forces for its command, or its forces were projected."""
+        return jnp.any(self.status != ControlStatus.COMMANDED.value, axis=0)
+
+    def settled(self, position: float, orientation: float) -> Int[Array, "*batch"]:
+        """The first step from which both errors stay below ``position`` m and ``orientation`` rad; T if never."""
+        out = ~((self.position_error <= position) & (self.orientation_error <= orientation))
+        steps = jnp.arange(1, out.shape[0] + 1, dtype=jnp.int32).reshape(-1, *[1] * (out.ndim - 1))
+        return jnp.max(jnp.where(out, steps, 0), axis=0)
+
+
+class _Setting(NamedTuple):
+    """What stays the same in all steps."""
+
+    grasp: Grasp
+    body: RigidBody
+    controller: ContactController
+    gravity: Any
+    plant: MujocoPlant | None
+
+
+def _size(v: Array) -> Array:
+    return jnp.sqrt(jnp.sum(v * v, axis=-1))
+
+
+@functools.partial(jax.jit, static_argnames=("steps", "record", "moving"))
+def _run(setting: _Setting, state: BodyState, reference: Reference, pushes, steps, timestep, record, moving):
+    grasp, body, controller, gravity, plant = setting
+    G, sound = grasp_map(grasp), body.valid
+    body = body.where(sound)
+    d = grasp.dimension
+    index = grasp.model.normal_index(d)
+
+    def step(carry: tuple[BodyState, Array], at: tuple[Any, Any]) -> tuple[Any, Any]:
+        now, last = carry
+        target = at[0] if moving else reference
+        command = controller.command(grasp, body, now, target, last, gravity)
+        invalid = ((command.status == ControlStatus.INVALID.value) | ~sound)[..., None]
+        status = jnp.where(sound, command.status, jnp.int32(ControlStatus.INVALID.value))
+        command = command._replace(force=jnp.where(invalid, 0.0, command.force), status=status)
+        wrench = rotate_wrench(now.orientation, applied(G, command.force))
+        if at[1] is not None:
+            wrench = wrench + at[1]
+        after = advance(body, now, wrench, timestep, gravity) if plant is None else plant.advance(now, wrench)
+        after = jax.tree.map(lambda new, old: jnp.where(invalid, old, new), after, now)
+        error = tracking_error(now, target).error
+        normal = command.force.reshape(*command.force.shape[:-1], grasp.contacts, -1)[..., index]
+        seen = (
+            command.status,
+            _size(error[..., :d]),
+            _size(error[..., d:]),
+            cone_use(grasp, command.force),
+            jnp.max(normal, axis=-1),
+        )
+        return (after, command.force), (seen, (now, command.force) if record else None)
+
+    start = (state, jnp.zeros((*grasp.batch_shape, grasp.contacts * grasp.model.force_size(d)), grasp.dtype))
+    (final, _), (seen, path) = jax.lax.scan(
+        step, start, (reference if moving else None, pushes), length=steps
+    )
+    states, force = path if record else (None, None)
+    status, position, orientation, use, largest = seen
+    return ClosedLoop(status, position, orientation, use, largest, final, states, force)
+
+
+def _laid_out(reference: Reference, batch: tuple[int, ...], steps: int, dtype) -> tuple[Reference, bool]:
+    """The reference ready to be scanned over, and whether it moves. One that fits both ways is a set point a lane."""
+    lead = reference.position.shape[:-1]
+    if lead in ((), batch):
+        return jax.tree.map(lambda x: x.astype(dtype), reference), False
+    if lead not in ((steps,), (steps, *batch)):
+        raise ValueError(
+            f"the reference's axes before the last must be (), the batch axes {batch}, or one a step, {(steps,)} or "
+            f"{(steps, *batch)}; got {lead}"
+        )
+    own = batch if lead != (steps,) else (1,) * len(batch)
+    return jax.tree.map(lambda x: x.astype(dtype).reshape(steps, *own, x.shape[-1]), reference), True
+
+
+def close_loop(
+    grasp: Grasp,
+    body: RigidBody,
+    controller: ContactController,
+    state: BodyState,
+    steps: int,
+    timestep: float = 0.002,
+    reference: Reference | None = None,
+    disturbance: Any = None,
+    gravity: Any = None,
+    plant: MujocoPlant | None = None,
+    record: bool = False,
+) -> ClosedLoop:
+    """Control, contact forces, motion: ``steps`` steps of ``timestep`` s for all grasps of a batch, in one call.
+
+    grasp, body  batch axes in front; the body's broadcast to the grasp's
+    controller   ``ComputedTorque`` or ``Regulator``; it knows neither the disturbance nor the future
+    state        where the objects start, (*batch)
+    reference    where they should be: a set point, or one for each step; None: at the origin, not turned
+    disturbance  (steps, m) or (steps, *batch, m): a wrench at the centre of mass, world axes, N and N m
+    plant        a ``mujoco_plant`` of the same body, timestep and gravity; None: the analytic ``advance``
+    record       keep all states and forces
+
+    Applied forces always lie in their friction cones; ``status`` says for each step whether they are the commanded
+    ones. A lane with bad numbers is INVALID and stays where it is. ValueError for wrong shapes, and for gains that
+    are too large for the time step.
+    """
+    if not isinstance(controller, ContactController):
+        raise ValueError(
+            f"controller must be a ComputedTorque or a Regulator, got {type(controller).__name__}"
+        )
+    if not timestep > 0 or not steps > 0:
+        raise ValueError(f"steps and timestep must be positive, got {steps} and {timestep}")
+    if grasp.dimension != body.dimension or grasp.dimension != state.dimension:
+        raise ValueError("grasp, body and state must all be spatial or all planar")
+    controller.check(timestep, grasp.dimension)
+    if plant is not None and abs(float(plant.timestep) - timestep) > 1e-6 * timestep:
+        raise ValueError(
+            f"the plant steps {float(plant.timestep):g} s, the loop {timestep:g} s: make them equal"
+        )
+    batch, m, dtype = grasp.batch_shape, wrench_dimension(grasp.dimension), grasp.dtype
+
+    def wide(x: Array, own: int) -> Array:
+        """Trailing ``own`` axes kept, batch axes in front of them."""
+        return jnp.broadcast_to(x.astype(dtype), (*batch, *x.shape[x.ndim - own :]))
+
+    try:
+        body = eqx.tree_at(lambda b: (b.mass, b.inertia), body, (wide(body.mass, 0), wide(body.inertia, 2)))
+        state = jax.tree.map(lambda x: wide(x, 1), state)
+    except ValueError as error:
+        raise ValueError(f"body and state must broadcast to the grasp's batch axes {batch}") from error
+    if reference is None:
+        reference = Reference.hold(BodyState.at_rest(grasp.dimension, (), dtype))
+    reference, moving = _laid_out(reference, batch, steps, dtype)
+    pushes = None
+    if disturbance is not None:
+        pushes = real_array(disturbance, "disturbance").astype(dtype)
+        if pushes.shape not in ((steps, m), (steps, *batch, m)):
+            raise ValueError(
+                f"disturbance must have shape ({steps}, {m}) or ({steps}, *batch, {m}), got {pushes.shape}"
+            )
+        if batch and pushes.ndim == 2:
+            pushes = pushes.reshape(steps, *[1] * len(batch), m)
+    setting = _Setting(grasp, body, controller, gravity, plant)
+    return _run(setting, state, reference, pushes, steps, jnp.asarray(timestep, dtype), record, moving)

@@ -1,0 +1,244 @@
+"""11.4, (11.30)-(11.33): can small changes of the contact forces steer the object back to its equilibrium?
+
+    controllable to first order   iff   rank [B A B .. A^(2m-1) B] = 2 m   iff   rank [B_c A_c B_c] = m
+
+where gravity, through A_c, acts as one more finger. Decided by rank in units of the body, never by a list of
+exceptions (erratum 10).
+
+What the rank test proves when forces are confined to their cones: at a non-marginal equilibrium a neighbourhood of the
+equilibrating forces is admissible, so full rank makes the grasp small-time locally controllable, resistant or not. At a
+marginal one some force may change one way only, and full rank alone proves nothing. Too low a rank says that the
+linearised motion leaves a direction alone; gyroscopic or other second-order effects may still reach it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from ..contacts import Grasp
+from ..core import Array, Float, Int, SpokenEnum, Status, rank_tolerance, wrench_dimension
+from ..resistance import wrench_resistance
+from .linearization import OperatingPoint, Scaled, first_order, is_equilibrium, linearize, scaled_system
+from .rigid_body import RigidBody
+
+__all__ = [
+    "Controllability",
+    "ControllabilityVerdict",
+    "controllability",
+    "controllability_matrix",
+    "gramian",
+]
+
+HORIZON = 1.0  # of the Gramian, in units of sqrt(l / g)
+
+
+class ControllabilityVerdict(SpokenEnum):
+    """What is proven about steering the object with admissible contact forces."""
+
+    RESISTANT = (
+        1,
+        "Controllable, because the grasp is wrench resistant: the fingers alone produce every wrench.",
+    )
+    CONTROLLABLE = (
+        2,
+        (
+            "Controllable though not wrench resistant: with the forces strictly inside their cones, small changes of "
+            "them and gravity together reach every motion."
+        ),
+    )
+    MARGINAL = (
+        3,
+        (
+            "Open: the linearisation has full rank, but the only forces that carry the weight are at the edge of their "
+            "cones, so they may change one way only and the rank proves nothing."
+        ),
+    )
+    NOT_CONTROLLABLE = (
+        4,
+        "Not controllable to first order: no small change of the contact forces affects the uncontrollable motion.",
+    )
+    NO_EQUILIBRIUM = (
+        5,
+        "No equilibrium: no admissible contact forces carry the weight, or the given ones do not.",
+    )
+    UNDECIDED = 6, "Undecided: a solver stopped before it had a proof either way."
+    INVALID = 7, "Invalid: the numbers are not a grasp, a body and a gravity."
+
+
+class Controllability(eqx.Module):
+    """Verdicts with their reasons, the batch axes in front. Scaled: lengths in l, times in sqrt(l / g), forces in m g.
+
+    verdict          int32, a ``ControllabilityVerdict``
+    rank             float, of the controllability matrix (11.30): 2 m where controllable; NaN where INVALID
+    reduced_rank     float, of [B_c A_c B_c] (11.32): m where controllable; NaN where INVALID
+    grasp_rank       float, of B_c alone: what the fingers do without gravity
+    singular_values  (*batch, m) of [B_c A_c B_c], scaled and folded, largest first
+    uncontrollable   (*batch, m) (velocity; angular velocity), unit norm with lengths in l: where the rank is too low,
+                     a motion on which neither the contact forces nor their turning with the body do work; where it is
+                     full, the motion on which they do least
+    weakest          (*batch, 2 m) the state (translation, rotation; their rates; m, rad, s), unit norm when scaled,
+                     that takes most effort to reach
+    effort           (*batch) that effort: the least root mean square of all scaled contact forces, in weights, that
+                     moves the object there in the time sqrt(l / g); infinite where not controllable
+    point            int32, an ``OperatingPoint``: the equilibrium
+    status           int32, a ``Status``: wrench resistance
+    force            (*batch, k n) N: the equilibrating forces, zero where there are none
+    """
+
+    verdict: Int[Array, "*batch"]
+    rank: Float[Array, "*batch"]
+    reduced_rank: Float[Array, "*batch"]
+    grasp_rank: Float[Array, "*batch"]
+    singular_values: Float[Array, "*batch m"]
+    uncontrollable: Float[Array, "*batch m"]
+    weakest: Float[Array, "*batch s"]
+    effort: Float[Array, "*batch"]
+    point: Int[Array, "*batch"]
+    status: Int[Array, "*batch"]
+    force: Float[Array, "*batch kn"]
+
+
+def controllability_matrix(
+    A: Float[Array, "*batch s s"], B: Float[Array, "*batch s n"]
+) -> Float[Array, "*batch s sn"]:
+    """``[B AB .. A^(s-1) B]`` (11.30) of any linear system."""
+    columns = [B]
+    for _ in range(A.shape[-1] - 1):
+        columns.append(A @ columns[-1])
+    return jnp.concatenate(columns, axis=-1)
+
+
+def gramian(
+    A: Float[Array, "*batch s s"], B: Float[Array, "*batch s n"], horizon: Any = HORIZON
+) -> Float[Array, "*batch s s"]:
+    """``W = int_0^T e^(A t) B B^T e^(A^T t) dt`` of a grasp's linearisation: exact, because A^4 = 0.
+
+    Reaching the state x at time T from rest takes controls of energy ``int |f|^2 dt`` of at least ``x^T W^-1 x``.
+    """
+    powers = [B]
+    for _ in range(3):
+        powers.append(A @ powers[-1])
+    horizon = jnp.asarray(horizon, B.dtype)[..., None, None]
+    total = jnp.zeros_like(A)
+    for i, left in enumerate(powers):
+        for j, right in enumerate(powers):
+            weight = horizon ** (i + j + 1) / (math.factorial(i) * math.factorial(j) * (i + j + 1))
+            total = total + weight * (left @ jnp.swapaxes(right, -1, -2))
+    return (total + jnp.swapaxes(total, -1, -2)) / 2
+
+
+def _rank(matrix: Array, tolerance: float) -> tuple[Array, Array]:
+    """Rank and singular values; as many as rows."""
+    values = jnp.linalg.svd(matrix, compute_uv=False)
+    missing = matrix.shape[-2] - values.shape[-1]
+    values = jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, max(missing, 0))])
+    return jnp.sum(values > tolerance * values[..., :1], axis=-1).astype(matrix.dtype), values
+
+
+def controllability(
+    grasp: Grasp,
+    body: RigidBody,
+    gravity: Any = None,
+    force: Any = None,
+    tolerance: float = 1e-8,
+) -> Controllability:
+    """``rank [B_c A_c B_c] = m`` (11.32), the equilibrium it is about, and what both together prove.
+
+    grasp      any batch axes; body: a ``RigidBody`` whose batch axes broadcast with the grasp's
+    gravity    m/s^2 in the grasp's axes, one vector or one a lane; None: (0, 0, -9.81), in the plane (0, -9.81)
+    force      (*batch, k n) the equilibrating forces; None: looked for, strictly inside the cones if there are any
+    tolerance  of the solvers behind the equilibrium and the wrench resistance
+
+    Rank counts singular values above ``_types.rank_tolerance`` times the largest one. Nothing raises inside; wrong
+    shapes raise ValueError. Sources: (11.29)-(11.33) with errata 9 and 10; Kalman 1963.
+    """
+    linear = linearize(grasp, body, force, gravity, tolerance)
+    resistance = wrench_resistance(grasp, tolerance, verdict_only=True)
+    status = jnp.broadcast_to(resistance.status, linear.point.shape)
+    system = scaled_system(grasp, body, gravity)
+    broken = (linear.point == OperatingPoint.INVALID.value)[..., None, None]
+    system = system._replace(B_c=jnp.where(broken, 0.0, system.B_c), A_c=jnp.where(broken, 0.0, system.A_c))
+    m, cut = system.A_c.shape[-1], rank_tolerance(system.A_c.dtype)
+
+    reduced = jnp.concatenate([system.B_c, system.A_c @ system.B_c], axis=-1)
+    reduced_rank, values = _rank(reduced, cut)
+    alone, _ = _rank(system.B_c, cut)
+    A, B = first_order(system.A_c, system.B_c)
+    rank, _ = _rank(controllability_matrix(A, B)[..., : 4 * B.shape[-1]], cut)  # A^4 = 0
+
+    full = reduced_rank == m
+    verdict = _verdict(linear.point, status, full)
+    unknown = verdict == ControllabilityVerdict.INVALID.value
+    motion = _least_worked(reduced, body, system)
+    weakest, effort = _weakest(A, B, system)
+    none = unknown[..., None]
+    return Controllability(
+        verdict,
+        jnp.where(unknown, jnp.nan, rank),
+        jnp.where(unknown, jnp.nan, reduced_rank),
+        jnp.where(unknown, jnp.nan, alone),
+        jnp.where(none, jnp.nan, values),
+        jnp.where(none, 0.0, motion),
+        jnp.where(none, 0.0, weakest),
+        jnp.where(full & ~unknown, effort, jnp.inf),
+        linear.point,
+        status,
+        linear.force,
+    )
+
+
+def _verdict(point: Array, status: Array, full: Array) -> Array:
+    verdict = jnp.full(point.shape, ControllabilityVerdict.UNDECIDED.value, jnp.int32)
+
+    def choose(where: Array, value: ControllabilityVerdict) -> None:
+        nonlocal verdict
+        verdict = jnp.where(where, jnp.int32(value.value), verdict)
+
+    choose((point == OperatingPoint.MARGINAL.value) & full, ControllabilityVerdict.MARGINAL)
+    choose((point == OperatingPoint.NON_MARGINAL.value) & full, ControllabilityVerdict.CONTROLLABLE)
+    known = is_equilibrium(point)
+    choose(known & ~full, ControllabilityVerdict.NOT_CONTROLLABLE)
+    # an internal force moves any equilibrium of a resistant grasp inside the cones
+    choose(known & full & (status == Status.RESISTANT.value), ControllabilityVerdict.RESISTANT)
+    absent = (point == OperatingPoint.NO_EQUILIBRIUM.value) | (point == OperatingPoint.NOT_BALANCED.value)
+    choose(absent, ControllabilityVerdict.NO_EQUILIBRIUM)
+    invalid = (point == OperatingPoint.INVALID.value) | (status == Status.INVALID.value)
+    choose(invalid, ControllabilityVerdict.INVALID)
+    return verdict
+
+
+def _units(system: Scaled, dimension: int) -> Array:
+    """(m,) what a scaled motion (translation; rotation) is multiplied by to be in m and rad."""
+    one = jnp.ones_like(system.length)
+    turns = wrench_dimension(dimension) - dimension
+    return jnp.stack([system.length] * dimension + [one] * turns, axis=-1)
+
+
+def _least_worked(reduced: Array, body: RigidBody, system: Scaled) -> Array:
+    """xi with ``xi . M [B_c A_c B_c]`` zero, or least: M^-1 times the last left singular vector's wrench.
+
+    Its part in M-orthogonal terms is the motion that no controllable one takes part in.
+    """
+    left = jnp.linalg.svd(reduced, full_matrices=True)[0][..., -1]
+    d = body.dimension
+    size = (body.mass * system.length**2)[..., None, None]
+    inverse = body.where(body.valid).inverse_inertia * size
+    turning = jnp.sum(inverse * left[..., None, d:], axis=-1)
+    xi = jnp.concatenate([left[..., :d], turning], axis=-1)
+    xi = xi / jnp.sqrt(jnp.sum(xi * xi, axis=-1, keepdims=True))
+    largest = jnp.take_along_axis(xi, jnp.argmax(jnp.abs(xi), axis=-1)[..., None], axis=-1)
+    return jnp.where(largest < 0, -xi, xi) * _units(system, d)
+
+
+def _weakest(A: Array, B: Array, system: Scaled) -> tuple[Array, Array]:
+    values, vectors = jnp.linalg.eigh(gramian(A, B))
+    least, state = values[..., 0], vectors[..., 0]
+    resolved = least > 4 * A.shape[-1] * jnp.finfo(A.dtype).eps * values[..., -1]
+    effort = jnp.where(resolved, 1 / jnp.sqrt(jnp.where(resolved, least, 1.0) * HORIZON), jnp.inf)
+    units = _units(system, 3 if A.shape[-1] == 12 else 2)
+    both = jnp.concatenate([units, units / system.time[..., None]], axis=-1)
+    return state * both, effort

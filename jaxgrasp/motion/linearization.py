@@ -1,0 +1,288 @@
+"""11.4, (11.28)-(11.29): a grasp linearised about an equilibrium, ``x' = A x + B f`` with deviations x and f.
+
+x = (translation; rotation vector; velocity; angular velocity), 2 m entries in world axes; at the equilibrium world and
+body axes coincide.
+
+    A = [[0, I], [A_c, 0]],   A_c = [[0, [gravity]_x], [0, 0]],   B = [[0], [M^-1 G^W]]
+
+With gravity = -g e_z this is the chapter's A_c with the factor g that it leaves out, Q = -[e_z]_x: contact forces that
+carry the weight turn with the body. A and B do not depend on which equilibrating forces they are.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ..contacts import Grasp, folded_grasp_map, grasp_map, length_scale
+from ..core import (
+    Array,
+    Bool,
+    Float,
+    Int,
+    SpokenEnum,
+    applied,
+    balance_tolerance,
+    real_array,
+    skew,
+    wrench_dimension,
+)
+from ..forces import EquilibriumKind, equilibrium
+from .rigid_body import RigidBody, gravity_vector
+
+__all__ = [
+    "Linearization",
+    "OperatingPoint",
+    "Scaled",
+    "first_order",
+    "is_equilibrium",
+    "linearize",
+    "scaled_system",
+]
+
+
+class OperatingPoint(SpokenEnum):
+    """What a grasp was linearised about."""
+
+    NON_MARGINAL = (
+        1,
+        "Non-marginal equilibrium: forces strictly inside every friction cone, so small changes of them are free.",
+    )
+    MARGINAL = (
+        2,
+        "Marginal equilibrium: some contact is at the edge of its friction cone, so its force may change one way only.",
+    )
+    NO_EQUILIBRIUM = 3, "No equilibrium: no admissible contact forces carry the weight."
+    NOT_BALANCED = (
+        4,
+        "The given forces are no equilibrium: they do not carry the weight, or leave their cones.",
+    )
+    UNDECIDED = 5, "Undecided: the solver stopped before it found forces or a proof that there are none."
+    INVALID = 6, "Invalid: the numbers are not a grasp, a body and a gravity."
+
+
+class Linearization(eqx.Module):
+    """A and B of (11.29), and the equilibrium they belong to.
+
+    point   int32, an ``OperatingPoint``; A and B are zero where there is no equilibrium
+    A       (*batch, 2 m, 2 m)
+    B       (*batch, 2 m, k n): columns of components that do not exist (mu = 0, gamma = 0, inactive) are zero
+    force   (*batch, k n) the equilibrating contact forces, N and N m; zero where there are none
+    slack   (*batch) N: ``min_i f_n,i - psi_i(f_i)`` of ``force``
+    """
+
+    point: Int[Array, "*batch"]
+    A: Float[Array, "*batch s s"]
+    B: Float[Array, "*batch s kn"]
+    force: Float[Array, "*batch kn"]
+    slack: Float[Array, "*batch"]
+
+
+def _spread(grasp: Grasp, body: RigidBody) -> tuple[Grasp, RigidBody]:
+    """Both with the same batch axes."""
+    if not isinstance(grasp, Grasp):
+        raise ValueError(f"the first argument must be a jaxgrasp.Grasp, got {type(grasp).__name__}")
+    if not isinstance(body, RigidBody):
+        raise ValueError(f"the second argument must be a jaxgrasp.RigidBody, got {type(body).__name__}")
+    if grasp.dimension != body.dimension:
+        raise ValueError(
+            f"the grasp lives in {grasp.dimension} dimensions, the body in {body.dimension}: a planar body has one "
+            "moment of inertia, a spatial one a 3 x 3 matrix"
+        )
+    own, other = grasp.batch_shape, body.batch_shape
+    try:
+        batch = jnp.broadcast_shapes(own, other)
+    except ValueError as error:
+        raise ValueError(f"the batch axes of grasp {own} and body {other} do not broadcast") from error
+
+    def wide(x: Array, lead: tuple[int, ...]) -> Array:
+        return jnp.broadcast_to(x, (*batch, *x.shape[len(lead) :]))
+
+    spread = jax.tree.map(lambda x: wide(x, own), grasp) if own != batch else grasp
+    dtype = grasp.dtype
+    return spread, jax.tree.map(lambda x: wide(x.astype(dtype), other), body)
+
+
+def _kinds(kind: Array) -> Array:
+    """``EquilibriumKind`` to ``OperatingPoint``."""
+    point = jnp.full(kind.shape, OperatingPoint.UNDECIDED.value, jnp.int32)
+    for found, means in (
+        (EquilibriumKind.NONE, OperatingPoint.NO_EQUILIBRIUM),
+        (EquilibriumKind.MARGINAL, OperatingPoint.MARGINAL),
+        (EquilibriumKind.NON_MARGINAL, OperatingPoint.NON_MARGINAL),
+        (EquilibriumKind.INVALID, OperatingPoint.INVALID),
+    ):
+        point = jnp.where(kind == found.value, jnp.int32(means.value), point)
+    return point
+
+
+def _judged(grasp: Grasp, load: Array, force: Array) -> tuple[Array, Array]:
+    """What given forces are, and their slack."""
+    d, n = grasp.dimension, grasp.model.force_size(grasp.dimension)
+    parts = force.reshape(*force.shape[:-1], grasp.contacts, n)
+    slack = jnp.where(grasp.active, grasp.model.feasibility_slack(parts, d), jnp.inf)
+    slack = jnp.min(slack, axis=-1)
+    left = applied(grasp_map(grasp), force) + load
+    per_length = jnp.where(jnp.arange(load.shape[-1]) < d, 1.0, 1 / length_scale(grasp)[..., None])
+    largest = jnp.max(jnp.abs(force), axis=-1) + jnp.max(jnp.abs(load), axis=-1)
+    allowed = balance_tolerance(grasp.dtype) * largest
+    idle = jnp.all(jnp.where(grasp.active[..., None], 0.0, parts) == 0, axis=(-1, -2))
+    balanced = (jnp.max(jnp.abs(left * per_length), axis=-1) <= allowed) & idle
+    point = jnp.where(slack > allowed, OperatingPoint.NON_MARGINAL.value, OperatingPoint.MARGINAL.value)
+    bad = ~balanced | (slack < -allowed)
+    point = jnp.where(bad, OperatingPoint.NOT_BALANCED.value, point).astype(jnp.int32)
+    finite = jnp.all(jnp.isfinite(force), axis=-1)
+    return jnp.where(finite, point, jnp.int32(OperatingPoint.INVALID.value)), slack
+
+
+def is_equilibrium(point: Int[Array, "*batch"]) -> Bool[Array, "*batch"]:
+    """Whether an ``OperatingPoint`` is an equilibrium, marginal or not."""
+    return (point == OperatingPoint.NON_MARGINAL.value) | (point == OperatingPoint.MARGINAL.value)
+
+
+def first_order(
+    A_c: Float[Array, "*batch m m"], B_c: Float[Array, "*batch m n"]
+) -> tuple[Float[Array, "*batch s s"], Float[Array, "*batch s n"]]:
+    """``[[0, I], [A_c, 0]]`` and ``[[0], [B_c]]`` of ``x'' = A_c x + B_c f``."""
+    zero, unit = jnp.zeros_like(A_c), jnp.broadcast_to(jnp.eye(A_c.shape[-1], dtype=A_c.dtype), A_c.shape)
+    A = jnp.concatenate([jnp.concatenate([zero, unit], -1), jnp.concatenate([A_c, zero], -1)], -2)
+    return A, jnp.concatenate([jnp.zeros_like(B_c), B_c], axis=-2)
+
+
+def linearize(
+    grasp: Grasp,
+    body: RigidBody,
+    force: Any = None,
+    gravity: Any = None,
+    tolerance: float = 1e-8,
+) -> Linearization:
+    """``x' = A x + B f~`` (11.29) about the equilibrium in which contact forces carry the body's weight.
+
+    grasp    any batch axes, positions relative to the centre of mass
+    body     a ``RigidBody``; its batch axes broadcast with the grasp's
+    force    (*batch, k n) equilibrating forces; None: found by ``equilibrium``, strictly inside the cones if any are
+    gravity  m/s^2 in the axes of the grasp, one vector or one a lane; None: 9.81 along -z, in the plane along -y
+
+    Works under ``jax.jit`` and ``jax.vmap``; A and B are differentiable. A lane without equilibrium, or with bad
+    numbers, says so in ``point``; wrong shapes raise ValueError.
+    """
+    grasp, body = _spread(grasp, body)
+    d, m, dtype = grasp.dimension, wrench_dimension(grasp.dimension), grasp.dtype
+    g = jnp.broadcast_to(gravity_vector(gravity, d, dtype), (*grasp.batch_shape, d))
+    fit = body.valid & jnp.all(jnp.isfinite(g), axis=-1)
+    body = body.where(body.valid)
+    g = jnp.where(jnp.isfinite(g), g, 0.0)
+    weight = body.mass[..., None] * g
+    load = jnp.concatenate([weight, jnp.zeros((*weight.shape[:-1], m - d), dtype)], axis=-1)
+    if force is None:
+        found = equilibrium(grasp, load, tolerance)
+        point, slack, forces = _kinds(found.kind), found.slack, found.force
+    else:
+        forces = real_array(force, "force").astype(dtype)
+        size = grasp.contacts * grasp.model.force_size(d)
+        if forces.ndim < 1 or forces.shape[-1] != size:
+            raise ValueError(
+                f"force must have shape (*batch, {size}): contact after contact in the model's order of components, "
+                f"got {forces.shape}"
+            )
+        forces = jnp.broadcast_to(forces, (*grasp.batch_shape, size))
+        point, slack = _judged(grasp, load, forces)
+        good = _good_numbers(grasp)
+        point = jnp.where(good, point, jnp.int32(OperatingPoint.INVALID.value))
+    point = jnp.where(fit, point, jnp.int32(OperatingPoint.INVALID.value))
+    there = is_equilibrium(point)
+    A, B = first_order(*_blocks(_sound(grasp), body, g))
+    keep = there[..., None, None]
+    return Linearization(
+        point,
+        jnp.where(keep, A, 0.0),
+        jnp.where(keep, B, 0.0),
+        jnp.where(there[..., None], forces, 0.0),
+        jnp.where(there, slack, -jnp.inf),
+    )
+
+
+def _good_numbers(grasp: Grasp) -> Array:
+    """Lanes whose numbers are a grasp: finite, non-negative coefficients, normals of some length, a contact."""
+    model, live = grasp.model, grasp.active
+    fine = jnp.all(jnp.isfinite(grasp.position) & jnp.isfinite(grasp.normal), axis=-1)
+    fine &= jnp.any(grasp.normal != 0, axis=-1)
+    for coefficient in (model.friction_coefficient, model.torsion_coefficient):
+        fine &= jnp.isfinite(coefficient) & (coefficient >= 0)
+    return jnp.all(fine | ~live, axis=-1) & jnp.any(live, axis=-1)
+
+
+def _sound(grasp: Grasp) -> Grasp:
+    """The grasp with harmless numbers wherever a contact does not exist or its lane is none: no NaN, no derivative."""
+    live = grasp.active & _good_numbers(grasp)[..., None]
+    upright = jnp.zeros(grasp.dimension, grasp.dtype).at[-1].set(1.0)
+    scaling = (
+        jnp.where(live, c, jnp.zeros_like(c))
+        for c in (grasp.model.friction_coefficient, grasp.model.torsion_coefficient)
+    )
+    position = jnp.where(live[..., None], grasp.position, 0.0)
+    normal = jnp.where(live[..., None], grasp.normal, upright)
+    return Grasp(position, normal, grasp.model.with_coefficients(*scaling), live)
+
+
+def _tilt(gravity: Array) -> Array:
+    """d (R f) / d theta over m_B for forces that carry the weight: ``[gravity]_x``, (d, t)."""
+    if gravity.shape[-1] == 3:
+        return skew(gravity)
+    return jnp.stack([gravity[..., 1], -gravity[..., 0]], axis=-1)[..., None]
+
+
+def _blocks(grasp: Grasp, body: RigidBody, gravity: Array) -> tuple[Array, Array]:
+    """A_c and ``B_c = M^-1 G^W`` at the identity orientation."""
+    d, m = grasp.dimension, wrench_dimension(grasp.dimension)
+    scale = jnp.where(grasp.active[..., None], grasp.model.scaling(d), 0.0)
+    exists = (scale > 0).reshape(*scale.shape[:-2], 1, -1)
+    G = jnp.where(exists, grasp_map(grasp), 0.0)
+    B_c = jnp.concatenate(
+        [G[..., :d, :] / body.mass[..., None, None], body.inverse_inertia @ G[..., d:, :]], axis=-2
+    )
+    tilt = _tilt(gravity)
+    upper = jnp.concatenate([jnp.zeros((*tilt.shape[:-2], d, d), tilt.dtype), tilt], axis=-1)
+    return jnp.concatenate([upper, jnp.zeros((*tilt.shape[:-2], m - d, m), tilt.dtype)], axis=-2), B_c
+
+
+class Scaled(NamedTuple):
+    """A_c (*batch, m, m) and folded B_c (*batch, m, k n) without units, and the units they were divided by.
+
+    Lengths in radii of gyration l, times in sqrt(l / g), forces in weights m_B g; where there is no gravity, in the
+    units of 1 m/s^2. B_c acts on scaled forces s, each contact in |s_t| <= s_n.
+    """
+
+    A_c: Float[Array, "*batch m m"]
+    B_c: Float[Array, "*batch m kn"]
+    length: Float[Array, "*batch"]
+    time: Float[Array, "*batch"]
+    force: Float[Array, "*batch"]
+
+
+@eqx.filter_jit
+def scaled_system(grasp: Grasp, body: RigidBody, gravity: Any = None) -> Scaled:
+    """The second-order system ``x'' = A_c x + B_c s`` in units of the body, for decisions that depend on no unit."""
+    grasp, body = _spread(grasp, body)
+    d, grasp = grasp.dimension, _sound(grasp)
+    body = body.where(body.valid)
+    g = jnp.broadcast_to(gravity_vector(gravity, d, grasp.dtype), (*grasp.batch_shape, d))
+    g = jnp.where(jnp.isfinite(g), g, 0.0)
+    size = jnp.sqrt(jnp.sum(g * g, axis=-1))
+    size = jnp.where(size > 0, size, jnp.ones_like(size))
+    length = body.gyration_radius
+    G = folded_grasp_map(grasp)
+    inertia = body.inertia / (body.mass * length * length)[..., None, None]
+    unit = RigidBody(jnp.ones_like(body.mass), inertia)
+    torque = unit.inverse_inertia @ (G[..., d:, :] / length[..., None, None])
+    A_c, _ = _blocks(grasp, unit, g / size[..., None])
+    return Scaled(
+        A_c,
+        jnp.concatenate([G[..., :d, :], torque], axis=-2),
+        length,
+        jnp.sqrt(length / size),
+        body.mass * size,
+    )

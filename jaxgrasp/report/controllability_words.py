@@ -1,0 +1,76 @@
+"""One grasp's controllability in words: the verdict, its reason, and the motion that forces do not reach."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..core import Status
+from ..motion import Controllability, ControllabilityVerdict, OperatingPoint
+from .words import screw, vector
+
+__all__ = ["explain_controllability", "motion_words"]
+
+V = ControllabilityVerdict
+
+
+def motion_words(twist: np.ndarray, centre_of_mass: np.ndarray, size: float) -> str:
+    """A twist (m,) at the centre of mass as a motion, positions in m in the axes of ``centre_of_mass`` (d,)."""
+    planar = len(centre_of_mass) == 2
+    if planar:  # the plane z = 0
+        twist = np.array([twist[0], twist[1], 0, 0, 0, twist[2]])
+    com = np.concatenate([centre_of_mass, np.zeros(3 - len(centre_of_mass))])
+    motion = screw(twist, com, size)
+    if motion.point is None:
+        return f"a slide along {vector(motion.direction[: len(centre_of_mass)])}"
+    offset = float(np.linalg.norm(motion.point - com))
+    where = (
+        "the centre of mass" if offset <= 1e-6 * size else f"{vector(motion.point[: len(centre_of_mass)])} m"
+    )
+    if planar:
+        return f"a rotation about {where}"
+    words = f"a rotation about the axis along {vector(motion.direction)} through {where}"
+    if motion.pitch:
+        words += f", advancing {1000 * motion.pitch * np.pi / 180:.3g} mm along it with each degree"
+    return words
+
+
+def explain_controllability(
+    found: Controllability, lane: int | tuple[int, ...] = (), centre_of_mass=None, size: float | None = None
+) -> str:
+    """The verdict of lane ``lane`` of ``found``, why, and the motion that is out of reach, or hardest to reach.
+
+    centre_of_mass  (d,) m, in whose axes points are told; default the origin
+    size            m, what counts as far from the centre of mass; default 5 cm
+    """
+    m = found.singular_values.shape[-1]
+    d = 3 if m == 6 else 2
+    com = np.zeros(d) if centre_of_mass is None else np.asarray(centre_of_mass, float)
+
+    def at(name: str) -> np.ndarray:
+        return np.asarray(getattr(found, name))[lane]
+
+    verdict, point = V(int(at("verdict"))), OperatingPoint(int(at("point")))
+    lines = [verdict.sentence]
+    if verdict is V.INVALID:
+        return lines[0]
+    if verdict in (V.NO_EQUILIBRIUM, V.MARGINAL, V.UNDECIDED):
+        lines.append(point.sentence)
+    rank, reduced, alone = (int(at(name)) for name in ("rank", "reduced_rank", "grasp_rank"))
+    lines.append(
+        f"The fingers alone reach {alone} of {m} directions, with gravity {reduced}; the controllability matrix has "
+        f"rank {rank} of {2 * m}."
+    )
+    size = 0.05 if size is None else size
+    if reduced < m:
+        motion = motion_words(at("uncontrollable"), com, size)
+        left = m - reduced
+        many = "" if left == 1 else f" (one of {left} independent ones)"
+        lines.append(f"Out of reach{many}: {motion}.")
+    elif verdict is not V.NO_EQUILIBRIUM:
+        lines.append(
+            f"The state hardest to reach takes {float(at('effort')):.3g} times the weight, root mean square of all "
+            "contact forces in units of their friction cones, for one radius of gyration in the time sqrt(l / g)."
+        )
+    if verdict is V.CONTROLLABLE and Status(int(at("status"))) is Status.MARGINAL:
+        lines.append("Its margin of wrench resistance is zero.")
+    return "\n".join(lines)

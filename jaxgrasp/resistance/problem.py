@@ -1,0 +1,129 @@
+"""The margin problem of wrench resistance on one tile of grasps (theory section 2), lanes on the last axis.
+
+    t* = max t   subject to   A s = 0,   s_0,i - |s_1..,i| >= t,   sum_i s_0,i = k
+
+A is the folded grasp map, lengths divided by L, rows orthonormalised. Substituting u = s - t e makes it a cone program
+
+    minimise -1 + (1/k) sum_i u_0,i   subject to   B u = -a,  u in K,     a = sum_i A_i e,  B = A - a e^T / k,
+
+whose optimal value is -t*. The internal force nearest to equal unit normal forces starts it strictly feasible, and
+lambda = 0 its dual, so the bracket [1 - <c, u>, 1 - <b, y>] around t* holds from the first iteration on.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from ..backend import stage
+from ..conic import Cone, ConeProgram, Iterate, Vector, cone_max, cone_sum, inner, tail_norm
+from ..contacts import (
+    Folded,
+    Projection,
+    minus_transposed,
+    normalized,
+    onto_null_space,
+    smallest_slack,
+    stored_norm,
+    to_twist,
+)
+from ..core import Array, unit_roundoff
+
+__all__ = ["Start", "identity", "margin_program", "starting_point", "upper_bound"]
+
+
+START_DEPTH = 0.3  # how far inside the cones the first forces lie, relative to their tangential size
+
+
+def identity(folded: Folded) -> Cone:
+    """e: unit normal force at every existing contact."""
+    zero = jnp.zeros_like(folded.exists)
+    return (folded.exists, *(zero for _ in folded.columns[1:]))
+
+
+class Start(NamedTuple):
+    """Where a lane begins: an interior iterate, and what the projection of e alone already shows.
+
+    lower      (L,) the margin of the projected unit forces, a lower bound of t*
+    escape     (L,) bool: the least-squares twist, ``A^T xi`` nearest to e, is an escape twist, so t* < 0
+    unbounded  (L,) bool: e lies in the row space of A: no internal force has a normal component, t* = -inf
+    """
+
+    iterate: Iterate
+    lower: Array
+    escape: Array
+    unbounded: Array
+
+
+@stage
+def _interior(exists: Array, s: Cone, lower: Array) -> Cone:
+    spread = cone_max(exists * tail_norm(s))
+    t = lower - START_DEPTH * jnp.maximum(spread, jnp.full_like(spread, 0.1))
+    first = jnp.where(exists > 0, s[0] - t, jnp.ones_like(t))
+    return (first, *(exists * x for x in s[1:]))
+
+
+def starting_point(folded: Folded, projection: Projection) -> Start:
+    """A strictly feasible primal-dual start, from the orthogonal projection of unit normal forces onto Null(A)."""
+    dtype = folded.norm.dtype
+    eps = unit_roundoff(dtype)
+    e = identity(folded)
+    y = projection.basis.resultant  # Q e, so Q^T y is the part of e that no internal force can have
+    raw = onto_null_space(projection, e)
+    square = cone_sum(inner(raw, raw))
+    unbounded = square <= (1024 * eps) ** 2 * folded.count
+    s = normalized(folded, raw)
+    lower = smallest_slack(folded.exists, s)
+    lower = jnp.where(unbounded, jnp.full_like(lower, -jnp.inf), lower)
+    opposing = tuple(a - b for a, b in zip(e, raw, strict=True))
+    twist_size = stored_norm(to_twist(projection, y))
+    escape = smallest_slack(folded.exists, opposing) > 64 * eps * folded.norm * twist_size
+
+    u = _interior(folded.exists, s, jnp.where(unbounded, jnp.zeros_like(lower), lower))
+    share = jnp.where(folded.exists > 0, 1 / folded.count, jnp.ones_like(folded.exists))
+    z = (share, *(jnp.zeros_like(share) for _ in s[1:]))
+    # A lane the projection already refutes keeps its twist as the dual point.
+    keep = escape | unbounded
+    dual = tuple(jnp.where(keep, -v, jnp.zeros_like(v)) for v in y)
+    return Start(Iterate(dual, u, z), lower, escape, unbounded)
+
+
+@stage
+def _deflated(normal_column: Array, resultant: Vector, share: Array) -> Array:
+    return jnp.stack([normal_column[i] - r * share for i, r in enumerate(resultant)])
+
+
+def margin_program(folded: Folded) -> ConeProgram:
+    """The cone program whose optimal value is -t*."""
+    share = folded.exists / folded.count
+    first = _deflated(folded.columns[0], folded.resultant, share)
+    cost = (share, *(jnp.zeros_like(share) for _ in folded.columns[1:]))
+    rhs = tuple(-r for r in folded.resultant)
+    return ConeProgram((first, *folded.columns[1:]), rhs, cost, folded.exists, constant=-1.0)
+
+
+@stage
+def _gauge(exists: Array, count: Array, v: Cone) -> Array:
+    reach = v[0] + tail_norm(v)
+    worst = cone_max(jnp.where(exists > 0, reach, jnp.full_like(reach, -jnp.inf)))
+    return count * worst - cone_sum(exists * v[0])
+
+
+def upper_bound(folded: Folded, y: Vector) -> Array:
+    """``1 + a.y / rho(y)`` with ``rho(y) = k max_i (v_n,i + |v_t,i|) - sum_i v_n,i``, ``v = A^T y``: t* is not larger.
+
+    1 / rho is the largest multiple of y that the dual admits, so the bound needs no feasible y. rho grows by the
+    rounding of v: where t* is hugely negative it is the small difference of large sums, and t* follows it squared.
+    """
+    zero = tuple(jnp.zeros_like(folded.exists) for _ in folded.columns)
+    v = minus_transposed(folded.columns, zero, tuple(-x for x in y))
+    rounding = 4 * unit_roundoff(folded.norm.dtype) * folded.count * stored_norm(y)
+    gauge = _gauge(folded.exists, folded.count, v) + rounding
+    descent = folded.resultant[0] * y[0]
+    for a, b in zip(folded.resultant[1:], y[1:], strict=True):
+        descent = descent + a * b
+    useful = (descent < 0) & (gauge > 0)
+    return 1 + jnp.where(
+        useful, descent / jnp.where(useful, gauge, jnp.ones_like(gauge)), jnp.zeros_like(gauge)
+    )
