@@ -8,7 +8,7 @@ from families import random_active, random_coefficients, random_contacts
 
 import jaxgrasp as jg
 from jaxgrasp import Status
-from jaxgrasp.conic.stop import Stop
+from jaxgrasp.conic.stopping import Stop
 
 TIGHT = {"float64": 2e-8, "float32": 5e-3}
 F32 = pytest.mark.f32

@@ -10,7 +10,7 @@ import pytest
 from families import random_coefficients, random_contacts
 
 import jaxgrasp as jg
-from jaxgrasp.conic.stop import Stop
+from jaxgrasp.conic.stopping import Stop
 
 K = 6
 

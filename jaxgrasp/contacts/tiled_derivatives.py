@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..backend import batched, inlined, kernel, map_tiles, to_lanes, to_rows
-from ..conic import ConvexProgram, Motion, Point, newton_solve
+from ..conic import ConvexConeProgram, ConvexPoint, KKTVector, kkt_solve
 from ..core import Array
 from .folded import Contacts
 
@@ -71,14 +71,18 @@ def tiled(function: Callable[..., Any], rows: Any, lanes: Any, width: int) -> An
 
 
 def tiled_solver(
-    program_of: Callable[[Any, Any], ConvexProgram], rows: Any, scales: Any, point: Point, width: int
-) -> Callable[[Motion], Motion]:
-    """``newton_solve`` at these points, ``tiled``.
+    program_of: Callable[[Any, Any], ConvexConeProgram],
+    rows: Any,
+    scales: Any,
+    point: ConvexPoint,
+    width: int,
+) -> Callable[[KKTVector], KKTVector]:
+    """``kkt_solve`` at these points, ``tiled``.
 
     ``program_of(rows, scales)`` is the program of A itself; ``scales.factor`` is the factor of A.
     """
 
-    def solve(rows: Any, scales: Any, point: Point, rhs: Motion) -> Motion:
-        return newton_solve(program_of(rows, scales), point, scales.factor, rhs)
+    def solve(rows: Any, scales: Any, point: ConvexPoint, rhs: KKTVector) -> KKTVector:
+        return kkt_solve(program_of(rows, scales), point, scales.factor, rhs)
 
     return lambda rhs: tiled(solve, rows, (scales, point, rhs), width)

@@ -24,6 +24,7 @@ from .rotations import (
     rotation_between,
     turned,
 )
+from .select import first_of
 from .status import SpokenEnum, Status
 from .tolerances import (
     balance_tolerance,
@@ -58,6 +59,7 @@ __all__ = [
     "cross",
     "cross_components",
     "edge_tolerance",
+    "first_of",
     "frame_components",
     "gap_floor",
     "identity_orientation",

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from ..backend import stage, to_lanes
 from ..conic import (
     Cone,
-    ConvexProgram,
-    Point,
+    ConvexConeProgram,
+    ConvexPoint,
     Stop,
     Vector,
     as_vector,
@@ -57,7 +57,7 @@ def _polished(basis: Cone, rhs: Array, exists: Array, u: Cone) -> Cone:
 
 
 @stage
-def _shortfall(program: ConvexProgram, u: Cone) -> Array:
+def _shortfall(program: ConvexConeProgram, u: Cone) -> Array:
     """How far u is outside the cones, the caps, the bounds, relative to the largest force; 0 inside (L,)."""
     exists = program.exists
     largest = cone_max(exists * jnp.abs(u[0]))
@@ -95,7 +95,7 @@ def _statuses(
 
 @stage
 def _power_left(
-    folded: Folded, program: ConvexProgram, twist: Vector, beta: Array | None, load: Load, limit: float
+    folded: Folded, program: ConvexConeProgram, twist: Vector, beta: Array | None, load: Load, limit: float
 ) -> Array:
     """Power of the load along ``twist`` less what forces up to ``limit`` loads and the torques can take up, on A.
 
@@ -128,7 +128,7 @@ def answer(
     projection: Projection,
     problem: Balance,
     demand: Demand,
-    point: Point,
+    point: ConvexPoint,
     ray: Array,
     stop: Array,
     tolerance: Array,
@@ -171,12 +171,12 @@ def answer(
 
 
 @stage
-def _all_rows(point: Point) -> Array:
+def _all_rows(point: ConvexPoint) -> Array:
     return point.rows()
 
 
 @stage
-def _blur(program: ConvexProgram, rows: Array, u: Cone, size: Array) -> Array:
+def _blur(program: ConvexConeProgram, rows: Array, u: Cone, size: Array) -> Array:
     """What rounding can do to the bound of multipliers as large as ``rows``."""
     forces = jnp.sqrt(cone_sum(program.exists * inner(u, u)))
     blur = vector_norm(as_vector(rows)) * (vector_norm(as_vector(program.rhs)) + forces) * size
@@ -185,7 +185,7 @@ def _blur(program: ConvexProgram, rows: Array, u: Cone, size: Array) -> Array:
 
 
 @stage
-def _scale(program: ConvexProgram, point: Point, size: Array) -> Array:
+def _scale(program: ConvexConeProgram, point: ConvexPoint, size: Array) -> Array:
     value = program.size(point) * size
     return value * size if program.curvature is not None else value
 

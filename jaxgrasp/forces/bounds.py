@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from ..backend import stage
 from ..conic import (
     Cone,
-    ConvexProgram,
+    ConvexConeProgram,
     Curvature,
     as_vector,
     cone_max,
@@ -46,7 +46,7 @@ def _logs(weight: Array, terms: tuple[Array, Array, Array], exists: Array, u: Co
 
 @stage
 def criterion_value(
-    program: ConvexProgram,
+    program: ConvexConeProgram,
     u: Cone,
     size: Array,
     weight: Array | None,
@@ -71,7 +71,7 @@ class Pull(NamedTuple):
 
 
 @stage
-def _pull(program: ConvexProgram, rows: Array) -> Pull:
+def _pull(program: ConvexConeProgram, rows: Array) -> Pull:
     m = program.rhs.shape[0]
     gain = -program.rhs[0] * rows[0]
     for i in range(1, m):
@@ -103,7 +103,7 @@ def _covered(short: Array, cap: Array | None, total: Array) -> Array:
 
 
 @stage
-def _linear_bound(program: ConvexProgram, pull: Pull) -> Array:
+def _linear_bound(program: ConvexConeProgram, pull: Pull) -> Array:
     """Dual value of prices and levels: the twist as it is, paying caps, or scaled to need none."""
     exists, x = program.exists, pull.x
     zero = jnp.zeros_like(exists)
@@ -123,7 +123,7 @@ def _linear_bound(program: ConvexProgram, pull: Pull) -> Array:
 
 
 @stage
-def _quadratic_bound(program: ConvexProgram, pull: Pull, u: Cone) -> Array:
+def _quadratic_bound(program: ConvexConeProgram, pull: Pull, u: Cone) -> Array:
     """Dual value with the tails' cost linearised at u, which convexity allows; s_0 minimised exactly in [0, cap]."""
     curvature: Curvature | None = program.curvature
     assert curvature is not None
@@ -140,7 +140,7 @@ def _quadratic_bound(program: ConvexProgram, pull: Pull, u: Cone) -> Array:
 
 
 @stage
-def _barrier_bound(program: ConvexProgram, pull: Pull, u: Cone) -> Array:
+def _barrier_bound(program: ConvexConeProgram, pull: Pull, u: Cone) -> Array:
     """Dual value of the fixed barriers: ``sum phi - phi log phi + phi/2 log det z + psi - psi log psi + psi log p``.
 
     Where u_0 is at its level, ``phi z_0 / det z = psi / p = level`` fixes z_0 and p; elsewhere p is that of the forces.
@@ -195,7 +195,7 @@ def _shifted(
 
 
 def dual_value(
-    program: ConvexProgram,
+    program: ConvexConeProgram,
     rows: Array,
     u: Cone,
     size: Array,

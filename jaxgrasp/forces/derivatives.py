@@ -22,7 +22,17 @@ import numpy as np
 from jax import lax
 
 from ..backend import inlined, to_lanes, to_rows
-from ..conic import Cholesky, Cone, ConvexProgram, Point, Stop, cone_sum, lagrangian, point_tangent, residuals
+from ..conic import (
+    Cholesky,
+    Cone,
+    ConvexConeProgram,
+    ConvexPoint,
+    Stop,
+    cone_sum,
+    lagrangian,
+    point_tangent,
+    residuals,
+)
 from ..contacts import (
     Component,
     Contacts,
@@ -63,7 +73,7 @@ class Solved(NamedTuple):
     smooth: Array
     iterations: Array
     stop: Array
-    point: Point | None
+    point: ConvexPoint | None
     scales: Scales | None
 
 
@@ -75,7 +85,7 @@ class _Form(NamedTuple):
     width: int
 
 
-def _program(form: _Form, rows: Rows, scales: Scales) -> ConvexProgram:
+def _program(form: _Form, rows: Rows, scales: Scales) -> ConvexConeProgram:
     """The scaled program ``A u = -w / size`` as a differentiable function of the data."""
     contacts, demand = rows
     folded = fold(contacts, form.components, scales.length)
@@ -107,7 +117,7 @@ def _safe(ok: Array, rows: Rows) -> Rows:
     return safe_contacts(ok, contacts), asked
 
 
-def _safe_point(ok: Array, point: Point) -> Point:
+def _safe_point(ok: Array, point: ConvexPoint) -> ConvexPoint:
     """An interior point in the lanes without a derivative; lanes last."""
 
     def keep(x: Array, value: float) -> Array:
@@ -118,7 +128,7 @@ def _safe_point(ok: Array, point: Point) -> Point:
 
     ones = jax.tree.map(lambda x: keep(x, 1.0), (point.slack, point.price))
     xi = None if point.xi is None else keep(point.xi, 2.0)
-    return Point(keep(point.y, 0.0), xi, cone(point.u), cone(point.z), *ones)
+    return ConvexPoint(keep(point.y, 0.0), xi, cone(point.u), cone(point.z), *ones)
 
 
 class _View(NamedTuple):
@@ -130,7 +140,7 @@ class _View(NamedTuple):
     cost: Array
 
 
-def _view(form: _Form, rows: Rows, scales: Scales, point: Point) -> _View:
+def _view(form: _Form, rows: Rows, scales: Scales, point: ConvexPoint) -> _View:
     """Forces, multipliers and the criterion's value, as functions of the data and the point."""
     contacts, demand = rows
     friction, torsion = to_lanes(contacts.friction), to_lanes(contacts.torsion)
@@ -149,7 +159,7 @@ def _view(form: _Form, rows: Rows, scales: Scales, point: Point) -> _View:
     return _View(force, twist, rates, cost)
 
 
-def _value(form: _Form, rows: Rows, scales: Scales, point: Point) -> Array:
+def _value(form: _Form, rows: Rows, scales: Scales, point: ConvexPoint) -> Array:
     """The Lagrangian in the caller's units, the point fixed."""
     demand = rows[1]
     program = _program(form, rows, scales)

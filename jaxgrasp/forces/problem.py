@@ -18,9 +18,9 @@ from ..backend import stage, to_lanes
 from ..conic import (
     Bounds,
     Cone,
-    ConvexProgram,
+    ConvexConeProgram,
+    ConvexPoint,
     Curvature,
-    Point,
     Vector,
     as_vector,
     cone_max,
@@ -81,7 +81,7 @@ class Balance(NamedTuple):
     valid  (L,) bool: the numbers are a problem      row_norm  (q, L): E is divided by it, or None
     """
 
-    program: ConvexProgram
+    program: ConvexConeProgram
     load: Load
     valid: Array
     row_norm: Array | None
@@ -238,7 +238,7 @@ def cone_program(
     demand: Demand,
     components: tuple[Component, ...],
     row_norm: Array | None = None,
-) -> tuple[ConvexProgram, Array | None, Array]:
+) -> tuple[ConvexConeProgram, Array | None, Array]:
     """The program for forces ``size u``, ``columns u = rhs``; the norms of its torque rows; which limits are numbers.
 
     ``row_norm`` fixes what the torque rows are divided by.
@@ -262,7 +262,7 @@ def cone_program(
         on_normal, on_cone, _ = (to_lanes(x) for x in demand.log_det)
         cone_floor, head_floor = _floors(weight, on_normal, on_cone, exists, size)
     curved = curvature(criterion, contacts, exists, components)
-    program = ConvexProgram(
+    program = ConvexConeProgram(
         columns,
         rhs,
         exists,
@@ -311,7 +311,7 @@ def balance(
 
 
 @stage
-def _first_forces(program: ConvexProgram, basis: Cone, count: Array) -> tuple[Cone, Array]:
+def _first_forces(program: ConvexConeProgram, basis: Cone, count: Array) -> tuple[Cone, Array]:
     """The least-norm forces, pressed into the cones: ``u = Q^T b + depth e``."""
     exists = program.exists
     least = rmatvec(basis, as_vector(program.rhs))
@@ -329,7 +329,7 @@ def _first_forces(program: ConvexProgram, basis: Cone, count: Array) -> tuple[Co
 
 
 @stage
-def _first_prices(program: ConvexProgram, u: Cone, depth: Array, count: Array) -> Point:
+def _first_prices(program: ConvexConeProgram, u: Cone, depth: Array, count: Array) -> ConvexPoint:
     """Slacks and prices that make the first forces dual feasible with y = 0, all products about ``depth / k``."""
     exists, one = program.exists, jnp.ones_like(program.exists)
     masks = program.masks()
@@ -354,7 +354,7 @@ def _first_prices(program: ConvexProgram, u: Cone, depth: Array, count: Array) -
         upper = jnp.maximum(program.bound - size, 0.5 * jnp.maximum(program.bound, size))
         price = (depth / count) / upper
     slack = Bounds(level, cap, head, upper, upper)
-    point = Point(
+    point = ConvexPoint(
         jnp.zeros_like(program.rhs), xi, u, u, slack, Bounds(level_price, cap_price, head_price, price, price)
     )
     z = program.stationarity(point)
@@ -362,7 +362,7 @@ def _first_prices(program: ConvexProgram, u: Cone, depth: Array, count: Array) -
     return point._replace(z=z)
 
 
-def starting_point(balance: Balance, projection: Projection, count: Array) -> Point:
+def starting_point(balance: Balance, projection: Projection, count: Array) -> ConvexPoint:
     """Dual feasible, inside every inequality; what ``B u = b`` and the limits lack is left to the solver."""
     u, depth = _first_forces(balance.program, projection.basis.columns, count)
     return _first_prices(balance.program, u, depth, count)
@@ -372,7 +372,7 @@ def starting_point(balance: Balance, projection: Projection, count: Array) -> Po
 
 
 @stage
-def power_left(program: ConvexProgram, rows: Array, limit: float) -> Array:
+def power_left(program: ConvexConeProgram, rows: Array, limit: float) -> Array:
     """``y.w - sum_i min(cap_i, limit) (|x_t,i| - x_0,i)+ - |beta|.bound`` over ``y.w``, x = A^T y + E^T beta.
 
     Positive, with y.w > 0: the load does more work along the twist y (the joints moving at beta) than forces up to
@@ -395,6 +395,6 @@ def power_left(program: ConvexProgram, rows: Array, limit: float) -> Array:
     return jnp.where(worth, 1 - taken / jnp.where(worth, power, jnp.ones_like(power)), -jnp.ones_like(power))
 
 
-def proves(program: ConvexProgram, rows: Array) -> Array:
+def proves(program: ConvexConeProgram, rows: Array) -> Array:
     """Whether ``rows`` prove that no forces up to ``FORCE_LIMIT`` times the load balance it."""
     return power_left(program, rows, FORCE_LIMIT) > 0.5

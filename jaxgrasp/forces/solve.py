@@ -17,7 +17,14 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from ..backend import batched, in_chunks, in_sweeps, kernel, tile_width, to_lanes, to_rows
-from ..conic import State, Stop, as_vector, begin_convex_program, regular, solve_convex_program
+from ..conic import (
+    ConvexState,
+    Stop,
+    as_vector,
+    begin_convex_cone_program,
+    regular,
+    solve_convex_cone_program,
+)
 from ..contacts import Component, Contacts, Folded, Grasp, Projection, contacts_of, fold, project, to_twist
 from ..core import Array, Bool, Float, Int, Status, gap_floor, real_array, unit_roundoff, wrench_dimension
 from .answer import Answer, answer
@@ -104,7 +111,7 @@ class _Progress(NamedTuple):
     multipliers  (m,) of A itself, where those of the state belong to its orthonormal rows
     """
 
-    state: State
+    state: ConvexState
     answer: Answer
     smooth: Array
     scales: Scales | None
@@ -115,19 +122,19 @@ def _tile_kernel(plan: _Plan) -> Callable[..., _Progress]:
     """A tile's whole way. One kernel for first steps and stragglers alike: it is what takes long to compile."""
 
     @kernel
-    def run(rows: Rows, state: State, fresh: Array, budget: Array, tolerance: Array) -> _Progress:
+    def run(rows: Rows, state: ConvexState, fresh: Array, budget: Array, tolerance: Array) -> _Progress:
         contacts, demand = rows
         folded, projection, problem = _problem(plan, rows)
         load = problem.load
         weighted = demand.criterion.barrier_weight is not None
         idle = jnp.zeros_like(load.rest) if weighted else load.rest
         point = starting_point(problem, projection, folded.count)
-        start = begin_convex_program(problem.program, point, ~problem.valid | load.off | idle)
+        start = begin_convex_cone_program(problem.program, point, ~problem.valid | load.off | idle)
         state = jax.tree.map(lambda new, old: jnp.where(fresh, new, old), start, _to_lanes(state))
         # A robust bound is read off the forces, which doubles what they lack.
         goal = tolerance / 10 if weighted else tolerance
         fine = 8 * unit_roundoff(tolerance.dtype)
-        state = solve_convex_program(problem.program, state, goal, proves, budget, fine)
+        state = solve_convex_cone_program(problem.program, state, goal, proves, budget, fine)
         result = answer(
             contacts, folded, projection, problem, demand, state.point, state.ray, state.stop, 4 * tolerance,
             plan.components, plan.dimension,
@@ -138,7 +145,7 @@ def _tile_kernel(plan: _Plan) -> Callable[..., _Progress]:
 
 
 def _progress(
-    plan: _Plan, state: State, result: Answer, folded: Folded, projection: Projection, problem: Balance
+    plan: _Plan, state: ConvexState, result: Answer, folded: Folded, projection: Projection, problem: Balance
 ) -> _Progress:
     optimal = (result.status == Status.OPTIMAL.value) & (state.stop != Stop.SKIPPED.value)
     smooth = optimal
@@ -175,7 +182,7 @@ def _shapes(plan: _Plan, rows: Rows) -> _Progress:
     def first(tile: Rows) -> _Progress:
         folded, projection, problem = _problem(plan, tile)
         point = starting_point(problem, projection, folded.count)
-        state = begin_convex_program(problem.program, point, ~problem.valid)
+        state = begin_convex_cone_program(problem.program, point, ~problem.valid)
         result = answer(
             *tile[:1], folded, projection, problem, tile[1], state.point, state.ray, state.stop,
             problem.load.size, plan.components, plan.dimension,

@@ -25,14 +25,14 @@ from ..conic import (
     Bounds,
     Cholesky,
     Cone,
-    ConvexProgram,
-    Point,
-    Shift,
+    ConvexConeProgram,
+    ConvexPoint,
+    PointShift,
     Stop,
     centring,
     cone_sum,
+    kkt_solve,
     lagrangian,
-    newton_solve,
     point_tangent,
     residuals,
 )
@@ -85,16 +85,16 @@ class _Form(NamedTuple):
     width: int
 
 
-def _program(form: _Form, contacts: Contacts, scales: Scales) -> ConvexProgram:
+def _program(form: _Form, contacts: Contacts, scales: Scales) -> ConvexConeProgram:
     """``margin.margin_program`` of A itself as a differentiable function of the contacts."""
     program = margin_program(fold(contacts, form.components, scales.length))
     none = (None,) * 7
-    return ConvexProgram(program.columns, jnp.stack(program.rhs), program.exists, program.cost[0], *none)
+    return ConvexConeProgram(program.columns, jnp.stack(program.rhs), program.exists, program.cost[0], *none)
 
 
-def _centring(form: _Form, contacts: Contacts, scales: Scales, point: Point) -> Shift:
+def _centring(form: _Form, contacts: Contacts, scales: Scales, point: ConvexPoint) -> PointShift:
     program = _program(form, contacts, scales)
-    return centring(program, point, lambda rhs: newton_solve(program, point, scales.factor, rhs))
+    return centring(program, point, lambda rhs: kkt_solve(program, point, scales.factor, rhs))
 
 
 def _added(a: Cone, b: Cone) -> Cone:
@@ -158,7 +158,7 @@ def _tangents(form: _Form, result: Solved, contacts: Contacts, change: Any) -> S
         lanes = to_lanes(kept(ok, rows, apex))
         return tuple(lanes[i] for i in range(lanes.shape[0]))
 
-    point = Point(-to_lanes(kept(ok, y, 0.0)), None, cone(u), cone(z), NO_BOUNDS, NO_BOUNDS)
+    point = ConvexPoint(-to_lanes(kept(ok, y, 0.0)), None, cone(u), cone(z), NO_BOUNDS, NO_BOUNDS)
     scales = jax.tree.map(lambda x: lax.stop_gradient(to_lanes(kept(ok, flat(x), 1.0))), result.scales)
     program = _program(form, data, scales)
     fixed = lax.stop_gradient((data, scales))
