@@ -4,7 +4,18 @@ It has never heard of grasping: it knows cones, a few dense equality constraints
 """
 
 from .cholesky import Cholesky, inverse_frobenius, null_combination, solve_lower, solve_transposed
-from .cone import Cone, cone_max, cone_min, cone_sum, determinant, inner, interior_distance, tail_norm
+from .cone import (
+    Cone,
+    cone_all,
+    cone_any,
+    cone_max,
+    cone_min,
+    cone_sum,
+    determinant,
+    inner,
+    interior_distance,
+    tail_norm,
+)
 from .convex_cone_program import Bounds, ConvexConeProgram, ConvexPoint, Curvature
 from .convex_interior_point import ConvexState, begin_convex_cone_program, solve_convex_cone_program
 from .derivatives import PointShift, centring, lagrangian, point_tangent, residuals
@@ -44,6 +55,8 @@ __all__ = [
     "begin_convex_cone_program",
     "begin_linear_cone_program",
     "centring",
+    "cone_all",
+    "cone_any",
     "cone_max",
     "cone_min",
     "cone_sum",

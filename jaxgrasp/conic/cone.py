@@ -15,6 +15,8 @@ from ..core import Array
 
 __all__ = [
     "Cone",
+    "cone_all",
+    "cone_any",
     "cone_max",
     "cone_min",
     "cone_sum",
@@ -47,6 +49,16 @@ def cone_max(x: Array) -> Array:
 def cone_min(x: Array) -> Array:
     """Minimum over the k cones."""
     return reduce(jnp.minimum, [x[i] for i in range(x.shape[0])])
+
+
+def cone_all(x: Array) -> Array:
+    """Whether x holds in all cones."""
+    return reduce(jnp.logical_and, [x[i] for i in range(x.shape[0])])
+
+
+def cone_any(x: Array) -> Array:
+    """Whether x holds in some cone."""
+    return reduce(jnp.logical_or, [x[i] for i in range(x.shape[0])])
 
 
 def inner(x: Cone, y: Cone) -> Array:

@@ -1,6 +1,7 @@
 """Ground floor: array vocabulary, tolerances by dtype, statuses, rigid-body geometry, errors. It knows no grasp."""
 
 from .arrays import Array, Bool, Float, Int, real_array
+from .broadcast import spread
 from .errors import UserError
 from .geometry import (
     applied,
@@ -79,6 +80,7 @@ __all__ = [
     "rounding_constant",
     "safe_root",
     "skew",
+    "spread",
     "stationary_tolerance",
     "turned",
     "unit_roundoff",

@@ -25,12 +25,14 @@ from ..conic import (
     regular,
     solve_convex_cone_program,
 )
-from ..contacts import Component, Contacts, Folded, Grasp, Projection, contacts_of, fold, project, to_twist
+from ..contacts import Component, Contacts, Grasp, contacts_of, tile_of, to_twist
 from ..core import Array, Bool, Float, Int, Status, gap_floor, real_array, unit_roundoff, wrench_dimension
 from .answer import Answer, answer
 from .criteria import Criterion, Gentlest
 from .derivatives import Rows, Scales, Solved, differentiable
-from .problem import Balance, Demand, balance, proves, starting_point
+from .infeasibility import proves
+from .problem import Demand, ForceProblem, force_problem
+from .starting_point import starting_point
 
 __all__ = ["ForceOptimum", "optimize_forces"]
 
@@ -97,11 +99,9 @@ def _to_rows(tree: Any) -> Any:
     return jax.tree.map(to_rows, tree)
 
 
-def _problem(plan: _Plan, rows: Rows):
+def _problem(plan: _Plan, rows: Rows) -> ForceProblem:
     contacts, demand = rows
-    folded = fold(contacts, plan.components)
-    projection = project(folded)
-    return folded, projection, balance(contacts, folded, projection, demand, plan.components, plan.dimension)
+    return force_problem(tile_of(contacts, plan.components, plan.dimension), demand)
 
 
 class _Progress(NamedTuple):
@@ -123,39 +123,33 @@ def _tile_kernel(plan: _Plan) -> Callable[..., _Progress]:
 
     @kernel
     def run(rows: Rows, state: ConvexState, fresh: Array, budget: Array, tolerance: Array) -> _Progress:
-        contacts, demand = rows
-        folded, projection, problem = _problem(plan, rows)
+        problem = _problem(plan, rows)
         load = problem.load
-        weighted = demand.criterion.barrier_weight is not None
+        weighted = problem.demand.criterion.barrier_weight is not None
         idle = jnp.zeros_like(load.rest) if weighted else load.rest
-        point = starting_point(problem, projection, folded.count)
-        start = begin_convex_cone_program(problem.program, point, ~problem.valid | load.off | idle)
+        skip = ~problem.valid | load.off | idle
+        start = begin_convex_cone_program(problem.program, starting_point(problem), skip)
         state = jax.tree.map(lambda new, old: jnp.where(fresh, new, old), start, _to_lanes(state))
         # A robust bound is read off the forces, which doubles what they lack.
         goal = tolerance / 10 if weighted else tolerance
-        fine = 8 * unit_roundoff(tolerance.dtype)
-        state = solve_convex_cone_program(problem.program, state, goal, proves, budget, fine)
-        result = answer(
-            contacts, folded, projection, problem, demand, state.point, state.ray, state.stop, 4 * tolerance,
-            plan.components, plan.dimension,
-        )  # fmt: skip
-        return _to_rows(_progress(plan, state, result, folded, projection, problem))
+        rounding = 8 * unit_roundoff(tolerance.dtype)
+        state = solve_convex_cone_program(problem.program, state, goal, proves, budget, rounding)
+        return _to_rows(_progress(plan, problem, state, answer(problem, state, 4 * tolerance)))
 
     return run
 
 
-def _progress(
-    plan: _Plan, state: ConvexState, result: Answer, folded: Folded, projection: Projection, problem: Balance
-) -> _Progress:
+def _progress(plan: _Plan, problem: ForceProblem, state: ConvexState, result: Answer) -> _Progress:
     optimal = (result.status == Status.OPTIMAL.value) & (state.stop != Stop.SKIPPED.value)
     smooth = optimal
     if problem.program.smoothing is None:
         smooth = optimal & regular(problem.program, state.point)
     if not plan.with_point:
         return _Progress(state, result, smooth, None, None)
-    scales = Scales(folded.length, problem.load.size, projection.factor, problem.row_norm)
-    y = state.point.y
-    return _Progress(state, result, smooth, scales, jnp.stack(to_twist(projection, as_vector(y))))
+    tile = problem.tile
+    scales = Scales(tile.folded.length, problem.load.size, tile.projection.factor, problem.row_norm)
+    y = to_twist(tile.projection, as_vector(state.point.y))
+    return _Progress(state, result, smooth, scales, jnp.stack(y))
 
 
 def _solve_rows(plan: _Plan, rows: Rows, count: Array, tolerance: Array) -> Solved:
@@ -180,14 +174,9 @@ def _shapes(plan: _Plan, rows: Rows) -> _Progress:
     """The shapes of what a tile leaves behind."""
 
     def first(tile: Rows) -> _Progress:
-        folded, projection, problem = _problem(plan, tile)
-        point = starting_point(problem, projection, folded.count)
-        state = begin_convex_cone_program(problem.program, point, ~problem.valid)
-        result = answer(
-            *tile[:1], folded, projection, problem, tile[1], state.point, state.ray, state.stop,
-            problem.load.size, plan.components, plan.dimension,
-        )  # fmt: skip
-        return _to_rows(_progress(plan, state, result, folded, projection, problem))
+        problem = _problem(plan, tile)
+        state = begin_convex_cone_program(problem.program, starting_point(problem), ~problem.valid)
+        return _to_rows(_progress(plan, problem, state, answer(problem, state, problem.load.size)))
 
     return jax.eval_shape(first, rows)
 

@@ -11,7 +11,6 @@ derivative 0.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -20,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ..backend import inlined, to_lanes, to_rows
+from ..backend import inlined, to_lanes
 from ..conic import (
     Bounds,
     Cholesky,
@@ -37,10 +36,11 @@ from ..conic import (
     residuals,
 )
 from ..contacts import (
+    BatchAxes,
     Component,
     Contacts,
+    filled,
     fold,
-    kept,
     masked,
     safe_contacts,
     tiled,
@@ -141,12 +141,8 @@ def differentiable(
 
 
 def _tangents(form: _Form, result: Solved, contacts: Contacts, change: Any) -> Solved:
-    batch = result.stop.shape
-    count = math.prod(batch)
-
-    def flat(x: Any) -> Any:
-        return x.reshape(count, *x.shape[len(batch) :])
-
+    batch = BatchAxes(result.stop.shape)
+    flat = batch.flat
     assert result.point is not None and result.scales is not None
     data, changes = jax.tree.map(flat, (contacts, change))
     ok = jnp.isfinite(flat(result.verdict.margin)) & (flat(result.stop) != Stop.SKIPPED.value)
@@ -155,11 +151,11 @@ def _tangents(form: _Form, result: Solved, contacts: Contacts, change: Any) -> S
     apex = jnp.zeros(u.shape[1:2], u.dtype).at[0].set(1.0)[:, None]
 
     def cone(rows: Array) -> Cone:
-        lanes = to_lanes(kept(ok, rows, apex))
+        lanes = to_lanes(filled(ok, rows, apex))
         return tuple(lanes[i] for i in range(lanes.shape[0]))
 
-    point = ConvexPoint(-to_lanes(kept(ok, y, 0.0)), None, cone(u), cone(z), NO_BOUNDS, NO_BOUNDS)
-    scales = jax.tree.map(lambda x: lax.stop_gradient(to_lanes(kept(ok, flat(x), 1.0))), result.scales)
+    point = ConvexPoint(-to_lanes(filled(ok, y, 0.0)), None, cone(u), cone(z), NO_BOUNDS, NO_BOUNDS)
+    scales = jax.tree.map(lambda x: lax.stop_gradient(to_lanes(filled(ok, flat(x), 1.0))), result.scales)
     program = _program(form, data, scales)
     fixed = lax.stop_gradient((data, scales))
     shift = tiled(partial(_centring, form), fixed[0], (fixed[1], lax.stop_gradient(point)), form.width)
@@ -175,15 +171,12 @@ def _tangents(form: _Form, result: Solved, contacts: Contacts, change: Any) -> S
         (changes, moved.u, -cost),
     )
 
-    y_read = -to_lanes(kept(ok, y, 0.0))
-    twist = kept(ok, flat(result.verdict.escape_twist), 0.0)
+    y_read = -to_lanes(filled(ok, y, 0.0))
+    twist = filled(ok, flat(result.verdict.escape_twist), 0.0)
     read = jnp.all(jnp.abs(_twist(y_read, scales.length) - to_lanes(twist)) < TWIST_READ, axis=0)
     _, turned = jax.jvp(lambda y: _twist(y, scales.length), (point.y,), (jnp.where(read, moved.y, 0.0),))
 
-    def back(x: Array) -> Array:
-        x = jnp.where(ok, x, jnp.zeros_like(x))
-        return to_rows(x).reshape(*batch, *x.shape[:-1])
-
+    back = partial(batch.back, ok)
     zero = jax.tree.map(zero_tangent, result)
     verdict = zero.verdict._replace(margin=back(-cost), internal_force=back(force), escape_twist=back(turned))
     moves = (back(-moved.y), back(jnp.stack(moved.u)), back(jnp.stack(moved.z)))

@@ -43,14 +43,14 @@ def identity(folded: Folded) -> Cone:
 
 
 class Start(NamedTuple):
-    """Where a lane begins: an interior iterate, and what the projection of e alone already shows.
+    """Where a lane begins: an interior point, and what the projection of e alone already shows.
 
     lower      (L,) the margin of the projected unit forces, a lower bound of t*
     escape     (L,) bool: the least-squares twist, ``A^T xi`` nearest to e, is an escape twist, so t* < 0
     unbounded  (L,) bool: e lies in the row space of A: no internal force has a normal component, t* = -inf
     """
 
-    iterate: LinearPoint
+    point: LinearPoint
     lower: Array
     escape: Array
     unbounded: Array

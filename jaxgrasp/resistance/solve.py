@@ -30,7 +30,7 @@ from ..conic import (
     row_svd,
     solve_linear_cone_program,
 )
-from ..contacts import Component, Contacts, Folded, Grasp, contacts_of, fold, project, to_twist
+from ..contacts import Component, Contacts, Folded, Grasp, contacts_of, fold, project, tile_of, to_twist
 from ..core import (
     Array,
     Float,
@@ -149,8 +149,8 @@ def _setup_kernel(plan: _Plan) -> Callable[[Contacts], _Setup]:
         start = starting_point(folded, projection)
         program = margin_program(projection.basis)
         refuted = start.unbounded | (start.escape if plan.verdict_only else jnp.zeros_like(start.escape))
-        dual = tuple(jnp.where(refuted, v, jnp.zeros_like(v)) for v in start.iterate.y)
-        state = begin_linear_cone_program(program, start.iterate._replace(y=dual), ~folded.valid | refuted)
+        dual = tuple(jnp.where(refuted, v, jnp.zeros_like(v)) for v in start.point.y)
+        state = begin_linear_cone_program(program, start.point._replace(y=dual), ~folded.valid | refuted)
         if plan.verdict_only:
             proven = start.lower > _room_for_rounding(folded, projection.sigma)
             stop = jnp.where(proven, jnp.int32(Stop.DECIDED.value), state.stop)
@@ -198,26 +198,14 @@ def _answer_kernel(plan: _Plan) -> Callable[..., _Reading]:
     def run(
         contacts: Contacts, rows: _State, unbounded: Array, rank_rows: Rank, tolerance: Array
     ) -> _Reading:
-        folded = fold(contacts, plan.components)
-        projection = project(folded)
-        iterate = rows.unpack().point
-        verdict = judge(
-            folded,
-            projection,
-            unbounded,
-            rank_rows._replace(null_twist=to_lanes(rank_rows.null_twist)),
-            iterate.u,
-            iterate.y,
-            tolerance,
-            plan.components,
-            to_lanes(contacts.friction),
-            to_lanes(contacts.torsion),
-            plan.dimension,
-        )
+        tile = tile_of(contacts, plan.components, plan.dimension)
+        point = rows.unpack().point
+        rank = rank_rows._replace(null_twist=to_lanes(rank_rows.null_twist))
+        verdict = judge(tile, rank, point.u, point.y, unbounded, tolerance)
         scales = multipliers = None
         if plan.with_point:
-            scales = Scales(folded.length, projection.factor)
-            multipliers = jnp.stack(to_twist(projection, iterate.y))
+            scales = Scales(tile.folded.length, tile.projection.factor)
+            multipliers = jnp.stack(to_twist(tile.projection, point.y))
         return jax.tree.map(to_rows, _Reading(verdict, scales, multipliers))
 
     return run
