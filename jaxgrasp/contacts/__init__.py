@@ -12,7 +12,17 @@ from .grasp_map import (
     length_scale,
     null_space,
 )
-from .models import MODELS, Component, ContactModel, Frictionless, HardFinger, SoftFinger
+from .models import (
+    MODELS,
+    Component,
+    ContactModel,
+    Frictionless,
+    HardFinger,
+    SoftFinger,
+    component_names,
+    contact_model,
+    model_name,
+)
 from .projection import (
     Projection,
     minus_transposed,
@@ -36,7 +46,9 @@ __all__ = [
     "MODELS",
     "Projection",
     "SoftFinger",
+    "component_names",
     "cone_use",
+    "contact_model",
     "contacts_of",
     "fold",
     "folded_grasp_map",
@@ -49,6 +61,7 @@ __all__ = [
     "length_scale",
     "masked",
     "minus_transposed",
+    "model_name",
     "nearest_admissible",
     "normalized",
     "null_space",
