@@ -15,7 +15,7 @@ from ..core import Status, UserError
 from ..formats import read_check_columns
 from ..jobs import CheckPlan, CheckRequest, controllability_of, plan_check
 from ..motion import ControllabilityVerdict
-from ..report import explain_controllability
+from ..report import explain_controllability, status_words
 from .options import Vector, options
 from .terminal import ProgressBar, line, resumable, say
 
@@ -104,9 +104,11 @@ def _counts(columns: dict[str, np.ndarray], title: str) -> Table:
         if here.any():
             back = int(columns["recovered"][here].sum())
             known = verdict in (ControllabilityVerdict.RESISTANT, ControllabilityVerdict.CONTROLLABLE)
-            words = verdict.name.replace("_", " ").lower()
             table.add_row(
-                words, f"{here.sum():,}", f"{100 * here.sum() / total:.2f} %", f"{back:,}" if known else ""
+                status_words(verdict),
+                f"{here.sum():,}",
+                f"{100 * here.sum() / total:.2f} %",
+                f"{back:,}" if known else "",
             )
     return table
 

@@ -20,6 +20,7 @@ from rich.table import Table
 
 from ..core import Status
 from ..jobs import Summary
+from ..report import status_words
 
 __all__ = ["ProgressBar", "counts", "line", "quantiles", "resumable", "say", "speed"]
 
@@ -103,8 +104,9 @@ def counts(summary: Summary, title: str, head: str) -> Table:
     table.add_column("share", justify="right")
     for status in Status:
         if summary.counts.get(status):
-            words = status.name.replace("_", " ").lower()
-            table.add_row(words, f"{summary.counts[status]:,}", f"{100 * summary.share(status):.2f} %")
+            table.add_row(
+                status_words(status), f"{summary.counts[status]:,}", f"{100 * summary.share(status):.2f} %"
+            )
     for reason, number in summary.removed.items():
         table.add_row(f"left out by --filter: {reason}", f"{number:,}", "")
     return table

@@ -5,10 +5,11 @@ from .contact_file import ContactFile, GraspFile
 from .force_table import Forces, force_schema, force_table, read_force_row
 from .npz import SavedGrasps, load_grasp, save_grasp
 from .parquet import (
+    METADATA_KEY,
     Contacts,
     Verdicts,
     as_row,
-    dump,
+    dump_metadata,
     read_metadata,
     read_row,
     verdict_schema,
@@ -17,6 +18,7 @@ from .parquet import (
 )
 
 __all__ = [
+    "METADATA_KEY",
     "ContactFile",
     "Contacts",
     "Forces",
@@ -26,7 +28,7 @@ __all__ = [
     "as_row",
     "check_schema",
     "check_table",
-    "dump",
+    "dump_metadata",
     "force_schema",
     "force_table",
     "load_grasp",

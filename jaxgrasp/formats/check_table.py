@@ -24,7 +24,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from .parquet import dump
+from .lists import fixed_lists
+from .parquet import METADATA_KEY, dump_metadata
 
 __all__ = ["check_schema", "check_table", "read_check_columns"]
 
@@ -46,7 +47,7 @@ COLUMNS = (
 
 def check_schema(metadata: dict[str, Any]) -> pa.Schema:
     """The columns above."""
-    return pa.schema(list(COLUMNS), {b"jaxgrasp": dump(metadata)})
+    return pa.schema(list(COLUMNS), {METADATA_KEY: dump_metadata(metadata)})
 
 
 def check_table(columns: dict[str, np.ndarray], steerable: np.ndarray, kind: pa.Schema) -> pa.Table:
@@ -66,8 +67,7 @@ def check_table(columns: dict[str, np.ndarray], steerable: np.ndarray, kind: pa.
     for name in kind.names:
         values = columns[name]
         if values.ndim == 2:
-            flat = pa.array(np.ascontiguousarray(values).reshape(-1))
-            arrays.append(pa.FixedSizeListArray.from_arrays(flat, values.shape[1]))
+            arrays.append(fixed_lists(values, kind.field(name).type))
         else:
             arrays.append(pa.array(values, mask=missing.get(name)).cast(kind.field(name).type))
     return pa.Table.from_arrays(arrays, schema=kind)

@@ -12,45 +12,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from ..core import Status, UserError
+from .lists import dense
 from .parquet import REQUIRED, Contacts, open_parquet, require, row_of, stored_metadata
 
 __all__ = ["ContactFile", "GraspFile"]
-
-
-def _dense(array: pa.Array, name: str) -> np.ndarray:
-    """Nested lists of one size as an array; nulls become NaN (False for booleans)."""
-    kind = array.type
-    if not (pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)):
-        if pa.types.is_boolean(kind):
-            return np.asarray(pc.fill_null(array, False).to_numpy(zero_copy_only=False), bool)
-        if not (pa.types.is_floating(kind) or pa.types.is_integer(kind)):
-            raise UserError(f"the column {name} must hold numbers, not {kind}")
-        if pa.types.is_integer(kind) and not array.null_count:
-            return array.to_numpy(zero_copy_only=False)
-        wide = kind if pa.types.is_float32(kind) else pa.float64()
-        return pc.fill_null(array.cast(wide), float("nan")).to_numpy(zero_copy_only=False)
-    valid = np.asarray(array.is_valid().to_numpy(zero_copy_only=False), bool)
-    if pa.types.is_fixed_size_list(kind):
-        size = kind.list_size
-    else:
-        sizes = np.unique(
-            pc.call_function("list_value_length", [array]).drop_null().to_numpy(zero_copy_only=False)
-        )
-        if len(sizes) > 1:
-            raise UserError(
-                f"the column {name} holds lists of different lengths, {sizes.min()} to {sizes.max()}; pad to "
-                "one length and mark the padding False in the column active"
-            )
-        size = int(sizes[0]) if len(sizes) else 0
-    inner = _dense(array.flatten(), name)
-    inner = inner.reshape(int(valid.sum()), size, *inner.shape[1:])
-    if valid.all():
-        return inner
-    fill = np.full(
-        (len(array), *inner.shape[1:]), False if inner.dtype == bool else np.nan, np.result_type(inner, bool)
-    )
-    fill[valid] = inner
-    return fill
 
 
 @dataclass
@@ -78,7 +43,7 @@ class ContactFile:
             raise UserError(f"{self.path}: the column position holds no contacts in its first row")
 
     def _vectors(self, batch: pa.RecordBatch, name: str) -> np.ndarray:
-        values = _dense(batch.column(name), name)
+        values = dense(batch.column(name), name)
         if values.ndim == 2 and values.shape[1] % 3 == 0:
             values = values.reshape(len(values), -1, 3)
         if values.ndim != 3 or values.shape[2] != 3:
@@ -100,7 +65,7 @@ class ContactFile:
         parts: dict[str, np.ndarray] = {name: self._vectors(batch, name) for name in REQUIRED}
         for name in ("friction", "torsion", "active"):
             if name in self.columns:
-                values = _dense(batch.column(name), name)
+                values = dense(batch.column(name), name)
                 parts[name] = np.broadcast_to(values[:, None], shape) if values.ndim == 1 else values
         for name, values in parts.items():
             if values.shape[:2] != shape:
@@ -110,7 +75,7 @@ class ContactFile:
         if "active" in parts and parts["active"].dtype != bool:
             raise UserError(f"{self.path}: the column active must be boolean")
         if "grasp_id" in self.columns:
-            grasp_id = _dense(batch.column("grasp_id"), "grasp_id")
+            grasp_id = dense(batch.column("grasp_id"), "grasp_id")
             if grasp_id.dtype.kind not in "iu":
                 raise UserError(f"{self.path}: the column grasp_id must hold whole numbers without nulls")
             grasp_id = grasp_id.astype(np.int64)

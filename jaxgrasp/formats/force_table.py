@@ -38,14 +38,23 @@ import numpy as np
 import pyarrow as pa
 
 from ..core import Status, UserError
-from .parquet import Contacts, as_row, dump, open_parquet, require, row_of, stored_metadata
+from .lists import fixed_lists, nullable_lists
+from .parquet import (
+    METADATA_KEY,
+    Contacts,
+    as_row,
+    dump_metadata,
+    open_parquet,
+    require,
+    row_of,
+    stored_metadata,
+)
 
 if TYPE_CHECKING:
     from ..forces import ForceOptimum
 
 __all__ = ["COLUMNS", "Forces", "force_schema", "force_table", "read_force_row"]
 
-KEY = b"jaxgrasp"
 COLUMNS = (
     "row", "grasp_id", "position", "normal", "friction", "torsion", "active", "status", "cost", "lower", "force",
     "contact_force", "escape_twist", "load_twist", "iterations",
@@ -82,19 +91,7 @@ def force_schema(fingers: int, dimension: int, metadata: dict[str, Any]) -> pa.S
         pa.int64(), pa.int64(), vectors, vectors, per_contact, per_contact, pa.list_(pa.bool_(), fingers),
         pa.int8(), real, real, pa.list_(real), pa.list_(vector), pa.list_(real), pa.list_(real), pa.int32(),
     )  # fmt: skip
-    return pa.schema(list(zip(COLUMNS, kinds, strict=True)), {KEY: dump(metadata)})
-
-
-def _lists(values: np.ndarray, kind: pa.DataType, missing: np.ndarray | None = None) -> pa.Array:
-    """``values`` (N, size) or (N, size, d) as lists of the type ``kind``, null in the rows where ``missing``."""
-    kept = values if missing is None else values[~missing]
-    inner = pa.array(np.ascontiguousarray(kept).reshape(-1))
-    for size in reversed(values.shape[2:]):
-        inner = pa.FixedSizeListArray.from_arrays(inner, size)
-    if missing is None:
-        return pa.FixedSizeListArray.from_arrays(inner, values.shape[1])
-    ends = np.concatenate([[0], np.cumsum(np.where(missing, 0, values.shape[1]))]).astype(np.int32)
-    return pa.ListArray.from_arrays(pa.array(ends), inner.cast(kind.value_type), mask=pa.array(missing))
+    return pa.schema(list(zip(COLUMNS, kinds, strict=True)), {METADATA_KEY: dump_metadata(metadata)})
 
 
 def force_table(rows: np.ndarray, contacts: Contacts, forces: Forces, kind: pa.Schema) -> pa.Table:
@@ -104,9 +101,9 @@ def force_table(rows: np.ndarray, contacts: Contacts, forces: Forces, kind: pa.S
     missing = {"escape_twist": ~infeasible, "load_twist": unknown, "force": unknown, "contact_force": unknown}
     columns = {"row": pa.array(rows, pa.int64()), "grasp_id": pa.array(contacts.grasp_id, pa.int64())}
     for name in ("position", "normal", "friction", "torsion", "active"):
-        columns[name] = _lists(getattr(contacts, name), kind.field(name).type)
+        columns[name] = fixed_lists(getattr(contacts, name), kind.field(name).type)
     for name, where in missing.items():
-        columns[name] = _lists(getattr(forces, name), kind.field(name).type, where)
+        columns[name] = nullable_lists(getattr(forces, name), kind.field(name).type, where)
     for name in VALUES:
         columns[name] = pa.array(getattr(forces, name)).cast(kind.field(name).type)
     return pa.Table.from_arrays([columns[name] for name in kind.names], schema=kind)

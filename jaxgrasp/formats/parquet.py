@@ -51,16 +51,18 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ..core import UserError
+from .lists import fixed_lists, nullable_lists
 
 if TYPE_CHECKING:
     from ..resistance import WrenchResistance
 
 __all__ = [
+    "METADATA_KEY",
     "SCHEMA_VERSION",
     "Contacts",
     "Verdicts",
     "as_row",
-    "dump",
+    "dump_metadata",
     "open_parquet",
     "read_metadata",
     "read_row",
@@ -73,7 +75,7 @@ __all__ = [
 ]
 
 SCHEMA_VERSION, READABLE = 2, (1, 2)
-KEY = b"jaxgrasp"
+METADATA_KEY = b"jaxgrasp"
 REQUIRED = ("position", "normal")
 # Columns with few distinct values; dictionaries on the others would cost time for nothing.
 REPETITIVE = ["normal.list.element.list.element", "friction.list.element", "torsion.list.element"]
@@ -156,31 +158,12 @@ def verdict_schema(fingers: int, dtype: str, metadata: dict[str, Any] | None = N
         ("escape_twist", pa.list_(real)),
         ("iterations", pa.int32()),
     ]
-    return pa.schema(columns, {KEY: dump(metadata)} if metadata is not None else None)
+    return pa.schema(columns, {METADATA_KEY: dump_metadata(metadata)} if metadata is not None else None)
 
 
-def dump(metadata: dict[str, Any]) -> bytes:
+def dump_metadata(metadata: dict[str, Any]) -> bytes:
     """JSON with sorted keys: equal metadata are equal bytes."""
     return json.dumps({"schema_version": SCHEMA_VERSION, **metadata}, sort_keys=True).encode()
-
-
-def _fixed(values: np.ndarray, kind: pa.DataType) -> pa.Array:
-    """``values`` (n, ...) as nested fixed-size lists."""
-    sizes, leaf = [], kind
-    while pa.types.is_fixed_size_list(leaf):
-        sizes.append(leaf.list_size)
-        leaf = leaf.value_type
-    array = pa.array(np.ascontiguousarray(values).reshape(-1), leaf)
-    for size in reversed(sizes):
-        array = pa.FixedSizeListArray.from_arrays(array, size)
-    return array
-
-
-def _nullable(values: np.ndarray, kind: pa.DataType, missing: Any) -> pa.Array:
-    """``values`` (n, size) as lists, null in the rows where ``missing``."""
-    ends = np.concatenate([[0], np.cumsum(np.where(missing, 0, values.shape[1]))]).astype(np.int32)
-    kept = pa.array(np.ascontiguousarray(values[~missing]).reshape(-1), kind.value_type)
-    return pa.ListArray.from_arrays(pa.array(ends), kept, mask=pa.array(missing))
 
 
 def verdict_table(contacts: Contacts, verdicts: Verdicts, kind: pa.Schema) -> pa.Table:
@@ -188,16 +171,18 @@ def verdict_table(contacts: Contacts, verdicts: Verdicts, kind: pa.Schema) -> pa
     invalid = np.isnan(verdicts.margin)
     no_force = ~np.isfinite(verdicts.margin)
     twist = verdicts.escape_twist
-    no_twist = ~np.isfinite(twist).all(axis=1) | ~twist.any(axis=1)
+    no_twist = np.asarray(~np.isfinite(twist).all(axis=1) | ~twist.any(axis=1))
     rank = np.where(invalid, 0, verdicts.rank).astype(np.int8)
     columns = {
         "grasp_id": pa.array(contacts.grasp_id, pa.int64()),
         "rank": pa.array(rank, pa.int8(), mask=invalid),
-        "internal_force": _nullable(verdicts.internal_force, kind.field("internal_force").type, no_force),
-        "escape_twist": _nullable(twist, kind.field("escape_twist").type, no_twist),
+        "internal_force": nullable_lists(
+            verdicts.internal_force, kind.field("internal_force").type, no_force
+        ),
+        "escape_twist": nullable_lists(twist, kind.field("escape_twist").type, no_twist),
     }
     for name in ("position", "normal", "friction", "torsion", "active"):
-        columns[name] = _fixed(getattr(contacts, name), kind.field(name).type)
+        columns[name] = fixed_lists(getattr(contacts, name), kind.field(name).type)
     for name in ("status", "margin", "upper", "iterations"):
         columns[name] = pa.array(getattr(verdicts, name)).cast(kind.field(name).type)
     return pa.Table.from_arrays([columns[name] for name in kind.names], schema=kind)
@@ -241,7 +226,7 @@ def require(path: Path, file: pq.ParquetFile, names: Sequence[str]) -> None:
 
 def stored_metadata(path: Path, file: pq.ParquetFile) -> dict[str, Any]:
     """The metadata under our key; empty where there are none, UserError where they are damaged or too new."""
-    raw = (file.schema_arrow.metadata or {}).get(KEY)
+    raw = (file.schema_arrow.metadata or {}).get(METADATA_KEY)
     if raw is None:
         return {}
     try:

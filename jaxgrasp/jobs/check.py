@@ -21,7 +21,7 @@ import numpy as np
 
 from ..backend import precision
 from ..contacts import Grasp, contact_model
-from ..formats import Contacts, check_schema, check_table, dump, read_check_columns
+from ..formats import Contacts, check_schema, check_table, dump_metadata, read_check_columns
 from ..motion import (
     BodyState,
     ClosedLoop,
@@ -60,7 +60,7 @@ def check(
     finished shards for ``resume``.
     """
     tell, total = progress or (lambda _: None), Summary(plan.count)
-    shards, kind = Shards(plan.output, dump(plan.metadata)), check_schema(plan.metadata)
+    shards, kind = Shards(plan.output, dump_metadata(plan.metadata)), check_schema(plan.metadata)
     if resume and shards.finished() is not None:
         total.add(_counted(read_check_columns(plan.output)["status"]))
         total.resumed = plan.count

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 
 from ..backend import precision
 from ..contacts import Grasp, contact_model
-from ..formats import Contacts, Verdicts, dump, verdict_schema, verdict_table
+from ..formats import Contacts, Verdicts, dump_metadata, verdict_schema, verdict_table
 from ..objects import geometric_filter
 from ..resistance import wrench_resistance
 from .screen_request import Chunk, ScreenPlan
@@ -42,7 +42,7 @@ def screen(
     Raises UserError where the output cannot be written or belongs to another run. KeyboardInterrupt leaves
     the finished shards for ``resume``.
     """
-    shards = Shards(plan.output, dump(plan.metadata))
+    shards = Shards(plan.output, dump_metadata(plan.metadata))
     if resume and (finished := _finished(plan, shards)) is not None:
         return finished
     with shards.claimed(resume):

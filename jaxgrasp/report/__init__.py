@@ -6,6 +6,7 @@ from .drawing import draw
 from .force_words import contact_rows, cost_words, infeasible_words, load_words
 from .proofs import reprove_forces, reprove_verdict
 from .verdict_words import explain
+from .words import status_words
 
 __all__ = [
     "ForceAnswer",
@@ -19,4 +20,5 @@ __all__ = [
     "load_words",
     "reprove_forces",
     "reprove_verdict",
+    "status_words",
 ]

@@ -40,6 +40,18 @@ class StoredGrasp:
         """Symbols of the force components of a contact, such as ("f_x", "f_y", "f_n")."""
         return component_names(self.model, len(self.centre_of_mass))
 
+    def cone_use(self, contact: Any, force: np.ndarray) -> float:
+        """``psi(f) / f_n`` of a force (n,): the share used of what friction allows; NaN where it does not press."""
+        coefficient = {"f_x": self.friction, "f_y": self.friction, "tau_n": self.torsion}
+        normal, square = 0.0, 0.0
+        for name, value in zip(self.components, force, strict=True):
+            if name == "f_n":
+                normal = float(value)
+            elif value != 0:
+                limit = coefficient[name][contact]
+                square += (value / limit) ** 2 if limit > 0 else np.inf
+        return float(np.sqrt(square)) / normal if normal > 0 else float("nan")
+
     def grasp(self, dtype: np.dtype | type = np.float64) -> Grasp:
         """As it was solved: at the centre of mass, in ``dtype`` (enable 64-bit arrays first for float64)."""
         coefficients = self.friction.astype(dtype), self.torsion.astype(dtype)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..core import Status, UserError, contact_frame
 from .answers import Verdict
-from .words import Screw, screw
+from .words import Screw, screw, status_words
 
 if TYPE_CHECKING:
     import trimesh
@@ -109,9 +109,7 @@ def draw(verdict: Verdict, path: Path, mesh: trimesh.Trimesh | None = None) -> N
     _frame(axes, shown)
     axes.view_init(*view_of(verdict, shown))
     kind = "" if motion is None else f": it escapes by a {motion.kind}"
-    figure.suptitle(
-        f"{verdict.status.name.replace('_', ' ').lower()}{kind}, margin {verdict.margin:.3f}", y=0.96
-    )
+    figure.suptitle(f"{status_words(verdict.status)}{kind}, margin {verdict.margin:.3f}", y=0.96)
     beside = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
         with matplotlib.rc_context({"svg.hashsalt": "jaxgrasp"}):

@@ -37,20 +37,6 @@ def load_words(load: dict[str, Any]) -> str:
     return f"Load: {told(wrench[:d])} N at the centre of mass and {torque} N m about it."
 
 
-def _share(part: np.ndarray, answer: ForceAnswer, contact: Any) -> str:
-    """psi / f_n: how much of what friction allows at this normal force is used."""
-    values = dict(zip(answer.components, part, strict=True))
-    normal, square = values["f_n"], 0.0
-    coefficient = {"f_x": answer.friction[contact], "f_y": answer.friction[contact]}
-    coefficient["tau_n"] = answer.torsion[contact]
-    for name, value in values.items():
-        if name != "f_n" and value != 0:
-            square += (value / coefficient[name]) ** 2 if coefficient[name] > 0 else np.inf
-    if normal <= 0:
-        return "-"
-    return f"{100 * np.sqrt(square) / normal:.1f} %"
-
-
 def _decimals(values: np.ndarray) -> int:
     """Decimals that show the largest value with four digits."""
     largest = float(np.abs(values).max(initial=0.0))
@@ -76,7 +62,8 @@ def contact_rows(answer: ForceAnswer) -> tuple[list[str], list[list[str]]]:
     for i in np.flatnonzero(answer.active):
         told = [_fixed(v, n) for v, n in zip(answer.force[i], decimals, strict=True)]
         pull = ", ".join(_fixed(v, newtons) for v in answer.contact_force[i])
-        rows.append([str(i), *told, _share(answer.force[i], answer, i), f"({pull})"])
+        used = answer.cone_use(i, answer.force[i])
+        rows.append([str(i), *told, "-" if np.isnan(used) else f"{100 * used:.1f} %", f"({pull})"])
     return heads, rows
 
 

@@ -57,17 +57,12 @@ def _forces(verdict: Verdict) -> list[str]:
         part = dict(zip(verdict.components, verdict.force[i], strict=True))
         f_n, tangential = part["f_n"], float(np.hypot(part.get("f_x", 0.0), part.get("f_y", 0.0)))
         words = [f"normal {f_n:.4g} N", f"tangential {tangential:.4g} N"]
-        share = _share(tangential, verdict.friction[i]) if "f_x" in part else 0.0
         if "tau_n" in part:
             words.append(f"spin torque {part['tau_n']:.4g} N m")
-            share = float(np.hypot(share, _share(abs(part["tau_n"]), verdict.torsion[i])))
-        used = f"{100 * share / f_n:.0f} % of the cone" if f_n > 0 else "no pressing force"
+        share = verdict.cone_use(i, verdict.force[i])
+        used = "no pressing force" if np.isnan(share) else f"{100 * share:.0f} % of the cone"
         lines.append(f"  contact {i}: {', '.join(words)}, {used}.")
     return lines
-
-
-def _share(value: float, coefficient: float) -> float:
-    return 0.0 if value == 0 else value / coefficient if coefficient > 0 else float("inf")
 
 
 def explain(verdict: Verdict) -> str:

@@ -7,10 +7,11 @@ pitch ``omega . v / |omega|^2`` metres a radian; with omega = 0 it is a slide al
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 
-__all__ = ["SMALL", "Screw", "motion_words", "screw", "vector"]
+__all__ = ["SMALL", "Screw", "motion_words", "screw", "status_words", "vector"]
 
 SMALL = 1e-6  # a part of a twist below this share of the whole counts as zero
 SLIGHT = 0.02  # a screw that advances less than this share of the object's size a radian is called a rotation
@@ -41,6 +42,11 @@ def screw(twist: np.ndarray, centre_of_mass: np.ndarray, size: float) -> Screw:
     point, pitch = centre_of_mass + np.cross(omega, v) / rate, float(omega @ v) / rate
     kind = "rotation" if abs(pitch) <= SLIGHT * size else "screw"
     return Screw(kind, omega / np.sqrt(rate), point, 0.0 if abs(pitch) <= SMALL * size else pitch)
+
+
+def status_words(status: Enum) -> str:
+    """The name of a status as words: "not resistant"."""
+    return status.name.replace("_", " ").lower()
 
 
 def vector(x: np.ndarray, smallest: float = 5e-7) -> str:
