@@ -553,6 +553,8 @@ def test_a_damaged_file_of_forces(written):
     for name in ("load", "tolerance", "centre_of_mass"):
         with pytest.raises(UserError, match=f"damaged or incomplete .*{name}"):
             ForceAnswer.from_row(row, {key: value for key, value in metadata.items() if key != name})
+    with pytest.raises(UserError, match=r"damaged or incomplete .*gecko"):
+        ForceAnswer.from_row(row, {**metadata, "model": {"kind": "gecko"}})
 
 
 def test_quantiles_of_costs_are_right_to_a_thousandth():

@@ -219,6 +219,12 @@ def test_damaged_and_foreign_files(tmp_path):
     )
     with pytest.raises(UserError, match="damaged"):
         parquet.read_metadata(path)
+    listed = kind.with_metadata({b"jaxgrasp": json.dumps({"schema_version": 2, "model": ["hard"]}).encode()})
+    parquet.write(
+        path, [parquet.verdict_table(*rows(), kind).replace_schema_metadata(listed.metadata)], listed
+    )
+    with pytest.raises(UserError, match="damaged"):
+        _ = ContactFile(path).kind
     pq.write_table(pa.table({"position": good, "normal": good}), path)
     with pytest.raises(UserError, match="lacks the columns friction"):
         parquet.read_row(path, 0)

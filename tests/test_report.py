@@ -183,8 +183,13 @@ def test_stored_evidence_is_proved_again():
 
 
 def test_rows_without_metadata_are_refused():
-    with pytest.raises(UserError, match="screen it again"):
-        Verdict.from_row({"internal_force": None}, {})
+    known = {"centre_of_mass": [0.0] * 3, "model": {"kind": "hard"}}
+    for metadata in ({}, {**known, "model": ["hard"]}, {**known, "model": {"kind": "gecko"}}):
+        with pytest.raises(UserError, match="screen it again"):
+            Verdict.from_row({"internal_force": None}, metadata)
+    for status in (None, 77):
+        with pytest.raises(UserError, match=f"the row's status, {status}, is none"):
+            Verdict.from_row({"status": status}, known)
 
 
 def test_forces_are_drawn_in_the_solver_s_frame():

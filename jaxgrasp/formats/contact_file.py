@@ -42,6 +42,14 @@ class ContactFile:
         if self.fingers < 1:
             raise UserError(f"{self.path}: the column position holds no contacts in its first row")
 
+    @property
+    def kind(self) -> str:
+        """The contact model's name, one of ``contacts.MODELS`` unless the file is newer than we are; "" if not said."""
+        model = self.metadata.get("model") or {}
+        if not isinstance(model, dict):
+            raise UserError(f"{self.path}: the metadata under the key 'jaxgrasp' is damaged")
+        return model.get("kind") or ""
+
     def _vectors(self, batch: pa.RecordBatch, name: str) -> np.ndarray:
         values = dense(batch.column(name), name)
         if values.ndim == 2 and values.shape[1] % 3 == 0:
@@ -91,11 +99,6 @@ class GraspFile(ContactFile):
     """
 
     dimension = 3
-
-    @property
-    def kind(self) -> str:
-        """The contact model's name, one of ``contacts.MODELS`` unless the file is newer than we are."""
-        return self.metadata["model"].get("kind")
 
     @property
     def centre_of_mass(self) -> np.ndarray:

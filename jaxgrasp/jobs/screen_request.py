@@ -250,8 +250,7 @@ def _from_contacts(request: ScreenRequest) -> tuple[ContactChoice, Candidates]:
     com = request.com if request.com is not None else known.get("centre_of_mass")
     if com is None:
         raise UserError(f"{path} does not say where the centre of mass is; give --com x,y,z in m, mesh frame")
-    kind = request.model or (known.get("model") or {}).get("kind", "hard")
-    contact = ContactChoice.of(kind, request.friction, request.torsion)
+    contact = ContactChoice.of(request.model or source.kind or "hard", request.friction, request.torsion)
     about = {
         "object": known.get("object"),
         "contacts": {"name": request.source, "sha256": digest(request.source)},

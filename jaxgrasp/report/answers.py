@@ -81,6 +81,10 @@ class Verdict(StoredGrasp):
             raise UserError(
                 "the file's metadata lack the centre of mass or the model; screen it again"
             ) from error
+        try:
+            status = Status(row["status"])
+        except ValueError as error:
+            raise UserError(f"the row's status, {row['status']}, is none that this jaxgrasp knows") from error
         force = row["internal_force"]
         position = np.asarray(row["position"], float).reshape(-1, 3)
         return cls(
@@ -91,7 +95,7 @@ class Verdict(StoredGrasp):
             active=np.asarray(row["active"], bool),
             centre_of_mass=com,
             model=kind,
-            status=Status(row["status"]),
+            status=status,
             margin=float("nan") if row["margin"] is None else row["margin"],
             upper=float("nan") if row["upper"] is None else row["upper"],
             rank=row["rank"],
@@ -124,6 +128,8 @@ class ForceAnswer(StoredGrasp):
         try:
             k = len(row["position"])
             force = None if row["force"] is None else np.reshape(row["force"], (k, -1))
+            com, kind = np.asarray(metadata["centre_of_mass"], float), metadata["model"]["kind"]
+            component_names(kind, len(com))  # KeyError for a model that we do not know
             names = ("row", "grasp_id", "contact_force", "escape_twist", "load_twist", "cost", "lower")
             said = ("load", "criterion", "max_normal", "tolerance")
             return cls(
@@ -132,8 +138,8 @@ class ForceAnswer(StoredGrasp):
                     for name in ("position", "normal", "friction", "torsion")
                 },
                 active=np.asarray(row["active"], bool),
-                centre_of_mass=np.asarray(metadata["centre_of_mass"], float),
-                model=metadata["model"]["kind"],
+                centre_of_mass=com,
+                model=kind,
                 status=Status(row["status"]),
                 force=force,
                 **{name: row[name] for name in names},
