@@ -25,7 +25,7 @@ def check_certificate(grasp, result, tolerance: float | None = None) -> np.ndarr
                epsilon: the rounding its bounds may show, by default 1e-9 of epsilon
 
     Runs on the host in float64 whatever the dtype of the grasp; a few operations a lane. What is asked of each status
-    is written in ``certificate/resistance.py``, ``certificate/forces.py`` and ``certificate/epsilon.py``.
+    is written in ``certificates/resistance.py``, ``certificates/forces.py`` and ``certificates/epsilon.py``.
     """
     if hasattr(result, "facets"):
         check = check_epsilon
