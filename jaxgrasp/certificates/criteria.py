@@ -55,7 +55,7 @@ class Multipliers(NamedTuple):
     x: np.ndarray
 
 
-def _top_share(violation: np.ndarray, cap: np.ndarray, total: float = 1.0) -> np.ndarray:
+def _level_multipliers(violation: np.ndarray, cap: np.ndarray, total: float = 1.0) -> np.ndarray:
     """The part of ``violation`` (N, k) that lambda of sum 1 should cover: the dearest caps first."""
     order = np.argsort(-cap, axis=-1, kind="stable")
     ordered = np.take_along_axis(violation, order, -1)
@@ -66,10 +66,10 @@ def _top_share(violation: np.ndarray, cap: np.ndarray, total: float = 1.0) -> np
     return out
 
 
-def _paid(left: np.ndarray, cap: np.ndarray, room: float) -> np.ndarray:
-    """``sum cap left``, where what is rounding beside 1 costs nothing without a cap."""
-    free = ~np.isfinite(cap) & (left <= room)
-    return np.sum(np.where(free | (left <= 0), 0.0, left * cap), -1)
+def _paid(uncovered: np.ndarray, cap: np.ndarray, room: float) -> np.ndarray:
+    """``sum cap uncovered``, where what is rounding beside 1 costs nothing without a cap."""
+    free = ~np.isfinite(cap) & (uncovered <= room)
+    return np.sum(np.where(free | (uncovered <= 0), 0.0, uncovered * cap), -1)
 
 
 def _log_det_terms(asked: Asked) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -146,17 +146,17 @@ def lower_bound(asked: Asked, multipliers: Multipliers, s: np.ndarray) -> np.nda
         largest = violation.max(-1) if name == "SmallestSum" else violation.sum(-1)
         scaled = np.where(largest > 0, gain / np.where(largest > 0, largest, 1.0), 0.0)
         if name == "SmallestSum":
-            left = np.maximum(violation - 1.0, 0.0)
+            uncovered = np.maximum(violation - 1.0, 0.0)
         else:
-            left = violation - _top_share(violation, cap)
-        paid = gain - _paid(left, cap, 0.0)
+            uncovered = violation - _level_multipliers(violation, cap)
+        paid = gain - _paid(uncovered, cap, 0.0)
         return np.maximum(np.maximum(scaled, paid), 0.0)
     if name == "Robust":
         return _robust_bound(asked, s, x, gain)
     half = _curvatures(asked)
-    pushed = 2 * half[..., 1:] * s[..., 1:]
-    rho = np.maximum(np.linalg.norm(x[..., 1:] + pushed, axis=-1) - x[..., 0], 0.0)
-    spent = np.sum(pushed * s[..., 1:], -1)
+    tangent = 2 * half[..., 1:] * s[..., 1:]
+    rho = np.maximum(np.linalg.norm(x[..., 1:] + tangent, axis=-1) - x[..., 0], 0.0)
+    spent = np.sum(tangent * s[..., 1:], -1)
     best = np.minimum(rho / 2, cap)
     return gain + np.sum(np.where(live, best * best - rho * best - spent / 2, 0.0), -1)
 
@@ -172,7 +172,7 @@ def _robust_bound(asked: Asked, s: np.ndarray, x: np.ndarray, gain: np.ndarray) 
     z_head = np.where(phi > 0, (phi + np.hypot(phi, 2 * level * x_tail)) / (2 * level), x_tail)
     needed = np.where(live, np.maximum(z_head + psi / level - x[..., 0], 0.0), 0.0)
     p = psi / np.where(live & (needed <= 0), s[..., 0], level)
-    share = _top_share(needed, cap)
+    share = _level_multipliers(needed, cap)
     alpha = np.where(np.isfinite(cap), needed - share, 0.0)
     leads = live & (head >= head.max(-1, keepdims=True))
     spare = np.maximum(1.0 - share.sum(-1, keepdims=True), 0.0) * leads / leads.sum(-1, keepdims=True)
