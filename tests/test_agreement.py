@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from clarabel_oracle import clarabel_margin
-from families import random_active, random_coefficients, random_contacts
+from grasps import random_active, random_coefficients, random_contacts
 
 import jaxgrasp as jg
 from jaxgrasp import Status

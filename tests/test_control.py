@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from motion_families import random_bodies, random_states
+from motion import random_bodies, random_states
 from scipy.linalg import solve_discrete_are
 from scipy.spatial.transform import Rotation
 

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from families import KINDS, random_active, random_coefficients, random_contacts, random_rotation
-from motion_families import random_bodies
+from grasps import KINDS, random_active, random_coefficients, random_contacts, random_rotation
+from motion import random_bodies
 
 import jaxgrasp as jg
 from jaxgrasp.core.tolerances import rank_tolerance

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from families import random_rotation
-from motion_families import random_bodies, random_states
+from grasps import random_rotation
+from motion import random_bodies, random_states
 from scipy.spatial.transform import Rotation
 
 import jaxgrasp as jg

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from families import random_active, random_coefficients, random_contacts
+from grasps import random_active, random_coefficients, random_contacts
 
 import jaxgrasp as jg
 from jaxgrasp import Status
