@@ -52,7 +52,7 @@ class Problems:
         rng = np.random.default_rng(seed + 1)
         self.count, self.k = count, k
         self.grasp = jg.Grasp(position, normal, jg.HardFinger(friction))
-        A = np.array(jg.folded_grasp_map(self.grasp)).reshape(count, 6, k, 3)[..., [2, 0, 1]]
+        A = np.array(jg.contacts.folded_grasp_map(self.grasp)).reshape(count, 6, k, 3)[..., [2, 0, 1]]
         self.A, self.friction = np.ascontiguousarray(A), friction
         self.wrench = rng.normal(size=(count, 6))
         if k == 2:
@@ -153,6 +153,7 @@ class Ours:
     def __init__(self, problems: Problems, criterion: str, mode: str):
         self.name, self.problems, self.mode = f"jaxgrasp {mode}", problems, mode
         self.count, self.criterion = problems.count, CRITERIA[criterion]
+        self.asked = {"wrench": problems.wrench, "criterion": self.criterion}
         grasp = problems.grasp
         self.data = (
             grasp.position,
@@ -167,7 +168,7 @@ class Ours:
             return jg.optimize_forces(
                 jg.Grasp(position, normal, jg.HardFinger(friction)),
                 wrench,
-                self.criterion,
+                criterion=self.criterion,
                 tolerance=TOLERANCE,
             )
 
@@ -203,7 +204,11 @@ class Ours:
             "infeasible": int((status == jg.Status.INFEASIBLE).sum()),
             "unsolved": int((status == jg.Status.STALLED).sum()),
             "largest_gap": float(np.max(np.asarray(out.gap)[optimal] / scale[optimal], initial=0.0)),
-            "certified": float(np.mean(jg.check_certificate(self.problems.grasp, out))),
+            "certified": float(
+                np.mean(
+                    jg.check(self.problems.grasp, out, wrench=self.problems.wrench, criterion=self.criterion)
+                )
+            ),
         }
 
 

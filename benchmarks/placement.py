@@ -271,7 +271,10 @@ def costs() -> list[dict[str, Any]]:
             "margin": (grasp, lambda g: jg.wrench_resistance(g).margin),
             "margin and gradient": (grasp, jax.jit(slope)),
             "epsilon L1": (sharp, lambda g, scale=scale: jg.epsilon_quality(g, torque_scale=scale).upper),
-            "epsilon Linf": (sharp, lambda g, scale=scale: jg.epsilon_quality(g, "Linf", scale).upper),
+            "epsilon Linf": (
+                sharp,
+                lambda g, scale=scale: jg.epsilon_quality(g, norm="Linf", torque_scale=scale).upper,
+            ),
             "critical friction": (sharp, lambda g: jg.critical_friction(g).factor),
             "guaranteed radius": (sharp, lambda g: jg.guaranteed_radius(g).radius),
         }

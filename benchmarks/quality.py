@@ -63,8 +63,8 @@ def pyramid(A: np.ndarray, edges: int, outer: bool) -> float:
 
 def brackets(grasp: jg.Grasp, norm: str) -> dict[str, Any]:
     count = grasp.batch_shape[0]
-    q, compiling, seconds = timed(lambda: jg.epsilon_quality(grasp, norm))
-    proof = jg.epsilon_quality(grasp, norm, certificate=True)
+    q, compiling, seconds = timed(lambda: jg.epsilon_quality(grasp, norm=norm))
+    proof = jg.epsilon_quality(grasp, norm=norm, certificate=True)
     width = np.asarray(q.width)
     return {
         "measure": f"epsilon {norm}",
@@ -74,7 +74,7 @@ def brackets(grasp: jg.Grasp, norm: str) -> dict[str, Any]:
         "share_within_1_percent": float(np.mean(width <= 0.01)),
         "largest_width": float(width.max()),
         "sharp": float(np.mean(np.asarray(q.smooth))),
-        "proved": float(np.mean(jg.check_certificate(grasp, proof))),
+        "proved": float(np.mean(jg.check(grasp, proof))),
         "median": float(np.median(np.asarray(q.upper))),
     }
 
@@ -105,7 +105,7 @@ def others(grasp: jg.Grasp) -> list[dict[str, Any]]:
         "margin": lambda: jg.wrench_resistance(grasp).margin,
         "critical friction": lambda: jg.critical_friction(grasp).factor,
         "guaranteed radius": lambda: jg.guaranteed_radius(grasp).radius,
-        "isotropy": lambda: jg.grasp_isotropy(grasp),
+        "isotropy": lambda: jg.quality.grasp_isotropy(grasp),
     }
     rows = []
     for name, call in calls.items():

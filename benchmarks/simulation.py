@@ -70,9 +70,9 @@ def clocked(run, repeats: int) -> tuple[float, list[float], Any]:
 
 def open_loop(body: jg.RigidBody, steps: int, repeats: int) -> dict[str, float]:
     """MJX alone under a constant wrench."""
-    plant, n = jg.mujoco_plant(body, H), len(body.mass)
+    plant, n = jg.motion.mujoco_plant(body, timestep=H), len(body.mass)
     start = jg.BodyState.at_rest(3, (n,)).displaced(jnp.zeros((n, 6)), 1.0)
-    wrench = -jg.gravity_term(body)
+    wrench = -jg.motion.gravity_term(body)
 
     @eqx.filter_jit
     def run(plant, state):
@@ -94,17 +94,24 @@ def closed_loop(
     push[10:35, :, :3] = 0.5 * np.asarray(body.mass)[:, None] * 9.81 * np.array([0.6, 0.8, 0.0])
     start = jg.BodyState.at_rest(3, (n,))
     controller = jg.ComputedTorque(jg.Gains.of_rate(RATE), criterion)
-    plant = jg.mujoco_plant(body, H) if mujoco else None
+    plant = jg.motion.mujoco_plant(body, timestep=H) if mujoco else None
 
     def run():
         return jg.close_loop(
-            grasp, body, controller, start, steps, H, disturbance=jnp.asarray(push), plant=plant
+            grasp,
+            body,
+            controller=controller,
+            state=start,
+            steps=steps,
+            timestep=H,
+            disturbance=jnp.asarray(push),
+            plant=plant,
         )
 
     first, times, out = clocked(run, repeats)
     status = np.asarray(out.status)
     return entry(first, times, n, steps) | {
-        "commanded": float((status == jg.ControlStatus.COMMANDED.value).mean()),
+        "commanded": float((status == jg.Status.COMMANDED.value).mean()),
         "largest_cone_use_less_1": float(np.asarray(out.cone_use).max() - 1),
         "largest_final_position_error": float(np.asarray(out.position_error)[-1].max()),
     }

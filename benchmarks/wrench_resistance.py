@@ -51,7 +51,7 @@ def random_grasps(count: int, k: int, seed: int) -> tuple[np.ndarray, np.ndarray
 def dual_program(grasp: jg.Grasp) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """``min a.y`` subject to ``c - M y`` in the cones: a (N, 6), M (N, 3 k, 6), c (3 k); t* = 1 + a.y."""
     n, k = grasp.position.shape[:2]
-    A = np.array(jg.folded_grasp_map(grasp)).reshape(n, 6, k, 3)
+    A = np.array(jg.contacts.folded_grasp_map(grasp)).reshape(n, 6, k, 3)
     blocks = np.moveaxis(A[..., [2, 0, 1]], 1, -1)  # (N, k, 3, 6), normal row first
     a = blocks[:, :, 0].sum(1)
     blocks[:, :, 0] -= a[:, None] / k
@@ -67,11 +67,13 @@ class Ours:
         self.name, self.grasp, self.options = name, grasp, options
         self.count = grasp.position.shape[0]
         start = time.perf_counter()
-        self.result = jg.wrench_resistance(grasp, TOLERANCE, **options)
+        self.result = jg.wrench_resistance(grasp, tolerance=TOLERANCE, **options)
         self.preparation = time.perf_counter() - start
 
     def run(self) -> None:
-        self.result = jax.block_until_ready(jg.wrench_resistance(self.grasp, TOLERANCE, **self.options))
+        self.result = jax.block_until_ready(
+            jg.wrench_resistance(self.grasp, tolerance=TOLERANCE, **self.options)
+        )
 
     def report(self, reference: np.ndarray) -> dict:
         res = self.result
@@ -84,7 +86,7 @@ class Ours:
             "marginal": int((status == jg.Status.MARGINAL).sum()),
             "undecided": int((status == jg.Status.UNDECIDED).sum()),
             "contradictions": int(wrong.sum()),
-            "certified": float(jg.check_certificate(self.grasp, res).mean()),
+            "certified": float(jg.check(self.grasp, res).mean()),
         }
         if not self.options:
             entry["largest_difference"] = _difference(np.asarray(res.margin), reference)

@@ -1,213 +1,136 @@
 """jaxgrasp: does this grasp hold, with which forces, and how do I make it better?
 
-Names follow the chapter "Wrench Resistant Grasps"; wrench resistance is what others call force closure.
+Names follow the chapter "Wrench Resistant Grasps". What others call it, and what it is called here:
+
+    force closure, wrench closure         wrench_resistance(grasp).status == Status.RESISTANT
+    form closure                          the same with Frictionless() contacts
+    grasp matrix, grasp map G             grasp_map(grasp)
+    point contact with friction, PCWF     HardFinger(friction)
+    soft finger, SFCE                     SoftFinger(friction, torsion)
+    internal forces, Null(G)              null_space(grasp), contacts.internal_force_part(grasp, force)
+    force distribution, grasping force    optimize_forces(grasp, wrench), the forces of a hand that squeezes: squeeze
+      optimisation, GFO
+    joint torque limits                   torque_limits=TorqueLimits(J, tau_max)
+    Ferrari-Canny, epsilon, largest ball  epsilon_quality(grasp)
+    task wrench space                     task_quality(grasp, wrenches)
+    grasp isotropy, volume                quality.grasp_isotropy(grasp), quality.grasp_volume(grasp)
+    small-time local controllability      controllability(grasp, body)
+    grasp synthesis, grasp refinement     place_contacts(surface)
+    certificate, proof                    check(grasp, answer, ..)
+
+Rooms, from the ground up: core, certificates, backend, conic, contacts, resistance, forces, quality, motion, lmi,
+objects, surfaces, placement, formats, report, jobs, cli. ``import jaxgrasp.X`` is a module for each.
 """
 
-from . import surfaces
-from .certificates import check_certificate
-from .conic import Stop
+import importlib
+
+from . import lmi as lmi
+from . import surfaces as surfaces
+from .certificates import check
 from .contacts import (
-    ContactModel,
     Frictionless,
     Grasp,
     HardFinger,
     SoftFinger,
-    folded_grasp_map,
+    TorqueLimits,
+    contact_frames,
+    force_vectors,
     grasp_map,
     grasp_rank,
-    grasp_singular_values,
-    internal_force_part,
     null_space,
 )
-from .core import Status
+from .core import Answer, Status
 from .core import __version__ as __version__
 from .forces import (
-    Criterion,
-    Equilibrium,
-    EquilibriumKind,
-    ForceOptimum,
     Gentlest,
     LeastNorm,
-    ResistibleWrenches,
+    OptimalForces,
     Robust,
     SmallestSum,
-    Squeeze,
     SumOfSquares,
     equilibrium,
     optimize_forces,
     resistible_wrenches,
     squeeze,
 )
-from .lmi import (
-    FrictionLMI,
-    LMIFeasibility,
-    LMIForces,
-    LMIProblem,
-    LMISolution,
-    LogDetTerm,
-    SDPSolution,
-    friction_lmi,
-    lmi_feasibility,
-    lmi_forces,
-    lmi_margin,
-    lmi_minimize,
-    margin_lmi,
-    sdp_minimize,
-    second_order_cone_lmi,
-)
 from .motion import (
     BodyState,
-    ClosedLoop,
     ComputedTorque,
-    Controllability,
-    ControllabilityVerdict,
-    ControlStatus,
     Gains,
-    Linearization,
-    MujocoPlant,
-    OperatingPoint,
-    Reference,
-    Regulator,
     RigidBody,
-    acceleration,
-    advance,
     close_loop,
     controllability,
-    controllability_matrix,
-    coriolis,
-    gramian,
-    gravity_term,
     linearize,
-    mass_matrix,
-    mujoco_model,
-    mujoco_plant,
     regulator,
-    world_grasp_map,
 )
-from .quality import (
-    CriticalFriction,
-    EpsilonQuality,
-    GuaranteedRadius,
-    TaskQuality,
-    critical_friction,
-    epsilon_quality,
-    friction_sweep,
-    grasp_isotropy,
-    grasp_volume,
-    guaranteed_radius,
-    task_quality,
-    with_friction_factor,
-)
-from .report import explain_controllability
-from .resistance import Trace, WrenchResistance, trace, wrench_resistance
+from .quality import critical_friction, epsilon_quality, guaranteed_radius, task_quality
+from .resistance import WrenchResistance, trace, wrench_resistance
 
 __all__ = [
     # 11.1 contacts, grasps, internal forces
-    "ContactModel",
     "Frictionless",
     "HardFinger",
     "SoftFinger",
     "Grasp",
     "grasp_map",
-    "folded_grasp_map",
     "grasp_rank",
-    "grasp_singular_values",
     "null_space",
-    "internal_force_part",
-    # 11.2 friction cones as linear matrix inequalities
-    "friction_lmi",
-    "FrictionLMI",
-    "margin_lmi",
-    "lmi_margin",
-    "lmi_minimize",
-    "lmi_feasibility",
-    "sdp_minimize",
-    "second_order_cone_lmi",
-    "LMIProblem",
-    "LogDetTerm",
-    "LMISolution",
-    "LMIFeasibility",
-    "SDPSolution",
+    "contact_frames",
+    "force_vectors",
     # 11.2 wrench resistance (force closure)
     "wrench_resistance",
     "WrenchResistance",
-    "Stop",
     "trace",
-    "Trace",
-    "save_grasp",
-    "load_grasp",
     # 11.3 grasp force optimisation
     "optimize_forces",
-    "ForceOptimum",
-    "Criterion",
+    "OptimalForces",
     "Gentlest",
     "Robust",
     "SmallestSum",
     "SumOfSquares",
     "LeastNorm",
+    "TorqueLimits",
     "equilibrium",
-    "Equilibrium",
-    "EquilibriumKind",
     "squeeze",
-    "Squeeze",
     "resistible_wrenches",
-    "ResistibleWrenches",
-    "lmi_forces",
-    "LMIForces",
     # quality: how good is the grasp
     "epsilon_quality",
-    "EpsilonQuality",
     "critical_friction",
-    "CriticalFriction",
-    "friction_sweep",
-    "with_friction_factor",
     "guaranteed_radius",
-    "GuaranteedRadius",
     "task_quality",
-    "TaskQuality",
-    "grasp_isotropy",
-    "grasp_volume",
+    # placement: how to make it better
+    "place_contacts",
     # 11.4 dynamics and controllability
     "RigidBody",
     "BodyState",
-    "mass_matrix",
-    "coriolis",
-    "gravity_term",
-    "world_grasp_map",
-    "acceleration",
-    "advance",
     "linearize",
-    "Linearization",
-    "OperatingPoint",
     "controllability",
-    "Controllability",
-    "ControllabilityVerdict",
-    "explain_controllability",
-    "controllability_matrix",
-    "gramian",
-    "mujoco_plant",
-    "mujoco_model",
-    "MujocoPlant",
-    "close_loop",
-    "ClosedLoop",
     "ComputedTorque",
-    "Regulator",
-    "regulator",
     "Gains",
-    "Reference",
-    "ControlStatus",
-    # surfaces to put contacts on
-    "surfaces",
-    # answers and their proofs
+    "regulator",
+    "close_loop",
+    # answers, their proofs, and files
+    "Answer",
     "Status",
-    "check_certificate",
+    "check",
+    "save_grasp",
+    "load_grasp",
 ]
+
+# Names and rooms that load more than NumPy and JAX: imported when they are first used.
+_LATER = {"place_contacts": "placement", "save_grasp": "formats", "load_grasp": "formats"}
+_LATER_ROOMS = ("backend", "certificates", "conic", "objects", "placement", "formats", "report", "jobs")
 
 
 def __getattr__(name: str):
-    """Rooms that load more than NumPy and JAX are imported when they are first used."""
-    if name in ("save_grasp", "load_grasp"):
-        from . import formats
+    if name in _LATER_ROOMS:
+        return importlib.import_module(f".{name}", __name__)
+    if name in _LATER:
+        return getattr(importlib.import_module(f".{_LATER[name]}", __name__), name)
+    from .core import renamed
 
-        return getattr(formats, name)
-    raise AttributeError(f"module 'jaxgrasp' has no attribute {name!r}")
+    raise AttributeError(renamed(name))
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, *_LATER_ROOMS})

@@ -124,7 +124,7 @@ print("equal normal forces make the wrench", np.asarray(G @ squeeze).round(12) +
 # All contacts together make one block-diagonal matrix.
 
 # %%
-P, S = jg.friction_lmi(grasp)
+P, S = jg.lmi.friction_lmi(grasp)
 print("P", P(squeeze).shape, " one S_l per force component:", S.shape)
 print(np.asarray(P(squeeze))[:3, :3])
 
@@ -172,7 +172,7 @@ normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
 many = jg.Grasp(-0.04 * normals, normals, jg.HardFinger(friction=0.8))
 
 result = jg.wrench_resistance(many)
-by_lmi = np.asarray(jg.lmi_margin(many))
+by_lmi = np.asarray(jg.lmi.lmi_margin(many))
 difference = np.abs(result.margin - by_lmi) / np.maximum(1, np.abs(by_lmi))
 print("largest difference, relative:", float(difference.max()))
 assert difference.max() < 1e-6
@@ -226,11 +226,11 @@ print(jg.Status(int(can.status)).sentence)
 print(f"margin in [{float(can.margin):.9f}, {float(can.margin + can.gap):.9f}], rank {int(can.rank)}")
 print("internal force, contact by contact (f_x, f_y, f_n):")
 print(np.asarray(can.internal_force).reshape(3, 3).round(6) + 0.0)
-print("checked:", bool(jg.check_certificate(grasp, can)))
+print("checked:", bool(jg.check(grasp, can)))
 
 forged = dataclasses.replace(result, status=np.full(200, jg.Status.RESISTANT))
-assert jg.check_certificate(many, result).all()
-accepted = jg.check_certificate(many, forged)
+assert jg.check(many, result).all()
+accepted = jg.check(many, forged)
 print(f"all 200 called resistant: {accepted.sum()} accepted, as many as are resistant: {resistant.sum()}")
 assert (accepted == resistant).all()
 
@@ -251,7 +251,7 @@ on_mug = jg.Grasp(position - mug.center_mass, inward, jg.HardFinger(friction=0.5
 screened = jg.wrench_resistance(on_mug)
 for status in jg.Status:
     print(f"{status.name:14s} {int((np.asarray(screened.status) == status).sum()):5d}")
-assert jg.check_certificate(on_mug, screened).all()
+assert jg.check(on_mug, screened).all()
 
 # %%
 row = 185

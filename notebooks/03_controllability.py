@@ -72,7 +72,7 @@ found = jg.controllability(pendulum, body)
 above, through = 50, 30
 for lane in (above, through):
     print(f"Line at {1000 * heights[lane]:.0f} mm:")
-    print(jg.explain_controllability(found, lane), "\n")
+    print(jg.report.explain_controllability(found, lane), "\n")
 assert (found.rank[above], found.rank[through], found.grasp_rank[above]) == (12, 10, 5)
 
 # %% [markdown]
@@ -136,11 +136,11 @@ plt.show()
 # %%
 few = pinched([0.02, 0.0])
 H, STEPS = 0.002, 1500
-keep = jg.regulator(few, body, H, effort=3.0)
+keep = jg.regulator(few, body, timestep=H, effort=3.0)
 print("stabilises:", keep.stabilizes.tolist())
 assert keep.stabilizes.tolist() == [True, False]
 start = jg.BodyState.at_rest(3, (2,)).displaced(jnp.array([0.0, 0, 0, 0.1, 0.02, 0]))
-swing = jg.close_loop(few, body, keep, start, STEPS, H)
+swing = jg.close_loop(few, body, controller=keep, state=start, steps=STEPS, timestep=H)
 t = H * np.arange(STEPS)
 
 fig, panels = plt.subplots(1, 2, figsize=(9, 3), layout="constrained")
@@ -177,7 +177,15 @@ control = jg.ComputedTorque(jg.Gains.of_rate(RATE))
 shares = 0.2 * np.arange(8)
 push = np.zeros((STEPS, 8, 6))
 push[25:50, :, 0] = shares * 0.3 * G
-out = jg.close_loop(on_mug, mug_body, control, jg.BodyState.at_rest(3, (8,)), STEPS, H, disturbance=push)
+out = jg.close_loop(
+    on_mug,
+    mug_body,
+    controller=control,
+    state=jg.BodyState.at_rest(3, (8,)),
+    steps=STEPS,
+    timestep=H,
+    disturbance=push,
+)
 t = H * np.arange(STEPS)
 
 fig, panels = plt.subplots(1, 3, figsize=(11, 3), layout="constrained")
@@ -192,7 +200,7 @@ for axes, label in zip(
     axes.set(xlabel="time (s)", ylabel=label)
 panels[2].set_ylim(0, 1.05)
 plt.show()
-status = {jg.ControlStatus(int(s)).name for s in np.unique(out.status)}
+status = {jg.Status(int(s)).name for s in np.unique(out.status)}
 print("every step:", status)
 assert status == {"COMMANDED"} and float(out.cone_use.max()) <= 1 + 1e-9
 assert float(out.position_error[-1].max()) < 1e-3
@@ -220,8 +228,16 @@ assert np.abs(design @ fit - after).max() < 0.02 * after.max()
 frictions = np.linspace(0.05, 0.75, 8)
 slippery = jg.Grasp(on_mug.position, on_mug.normal, jg.HardFinger(frictions[:, None] * np.ones((8, 3))))
 push[25:50, :, 0] = 0.6 * 0.3 * G
-slips = jg.close_loop(slippery, mug_body, control, jg.BodyState.at_rest(3, (8,)), STEPS, H, disturbance=push)
-lost = np.mean(np.asarray(slips.status) == jg.ControlStatus.INFEASIBLE, axis=0)
+slips = jg.close_loop(
+    slippery,
+    mug_body,
+    controller=control,
+    state=jg.BodyState.at_rest(3, (8,)),
+    steps=STEPS,
+    timestep=H,
+    disturbance=push,
+)
+lost = np.mean(np.asarray(slips.status) == jg.Status.INFEASIBLE, axis=0)
 margin = jg.wrench_resistance(slippery).margin
 print("mu     margin   infeasible steps   final error (m)")
 for i, mu in enumerate(frictions):
@@ -235,11 +251,28 @@ assert float(slips.cone_use.max()) <= 1 + 1e-9
 # The same loop around MJX instead of the analytic step: the same path.
 
 # %%
-plant = jg.mujoco_plant(jax.tree.map(lambda x: jnp.broadcast_to(x, (8, *x.shape)), mug_body), H)
-again = jg.close_loop(
-    on_mug, mug_body, control, jg.BodyState.at_rest(3, (8,)), STEPS, H, disturbance=push, plant=plant
+plant = jg.motion.mujoco_plant(
+    jax.tree.map(lambda x: jnp.broadcast_to(x, (8, *x.shape)), mug_body), timestep=H
 )
-other = jg.close_loop(on_mug, mug_body, control, jg.BodyState.at_rest(3, (8,)), STEPS, H, disturbance=push)
+again = jg.close_loop(
+    on_mug,
+    mug_body,
+    controller=control,
+    state=jg.BodyState.at_rest(3, (8,)),
+    steps=STEPS,
+    timestep=H,
+    disturbance=push,
+    plant=plant,
+)
+other = jg.close_loop(
+    on_mug,
+    mug_body,
+    controller=control,
+    state=jg.BodyState.at_rest(3, (8,)),
+    steps=STEPS,
+    timestep=H,
+    disturbance=push,
+)
 difference = float(jnp.abs(again.final.position - other.final.position).max())
 print(f"largest difference of the final positions: {difference:.1e} m")
 assert difference < 1e-9
@@ -247,7 +280,9 @@ assert difference < 1e-9
 # %%
 verdict = jg.wrench_resistance(on_mug)
 forces = (
-    jg.optimize_forces(on_mug, np.array([0, 0, -0.3 * G, 0, 0, 0]), jg.SumOfSquares()).force[0].reshape(3, 3)
+    jg.optimize_forces(on_mug, np.array([0, 0, -0.3 * G, 0, 0, 0]), criterion=jg.SumOfSquares())
+    .force[0]
+    .reshape(3, 3)
 )
 drawn = Verdict(
     position=position,

@@ -142,7 +142,7 @@ for name, grasp in (("random", origin), ("placed", placed.grasp)):
 
 best = placed.grasp[:1]
 quality = jg.epsilon_quality(best, torque_scale=radius, certificate=True)
-assert jg.check_certificate(best, quality).all()
+assert jg.check(best, quality).all()
 print("proved:", float(quality.lower[0]), "<= epsilon <=", float(quality.upper[0]))
 print("holds down to", float(jg.critical_friction(best).factor[0]) * friction, "of friction")
 print("contacts may be off by", 1e3 * float(jg.guaranteed_radius(best).radius[0]) * radius, "mm")

@@ -106,7 +106,7 @@ def test_clarabel_agrees(name, k, count):
     assert (optimum[compared] <= (margin + gap + 1e-9 * scale)[compared]).all()
     assert_not_contradicted(status, rank, dimension, optimum, known, name)
     assert missed.mean() < 1e-3
-    assert jg.check_certificate(grasp, res).all()
+    assert jg.check(grasp, res).all()
 
     if name in VERDICT_ONLY:
         verdict_only_agrees(grasp, rank, margin, optimum, known)
@@ -123,7 +123,7 @@ def verdict_only_agrees(grasp, rank, margin, optimum, known):
     assert (upper[finite] >= optimum[finite] - 1e-9 * scale).all()
     unclear = (status == Status.MARGINAL) | (status == Status.UNDECIDED)
     assert (unclear & (np.abs(margin) > 1e-6)).mean() < 1e-3
-    assert jg.check_certificate(grasp, quick).all()
+    assert jg.check(grasp, quick).all()
 
 
 def test_there_are_enough_grasps():
@@ -137,7 +137,7 @@ def test_there_are_enough_grasps():
 @pytest.mark.parametrize(("name", "k", "count"), RUNS)
 def test_rank_is_that_of_the_folded_map_per_length(name, k, count):
     grasp = random_grasps(name, k=k, count=count)
-    A = np.array(jg.folded_grasp_map(grasp))
+    A = np.array(jg.contacts.folded_grasp_map(grasp))
     position = np.where(np.asarray(grasp.active)[..., None], np.asarray(grasp.position), 0.0)
     length = np.linalg.norm(position, axis=-1).max(-1)
     A[:, grasp.dimension :] /= np.where(length > 0, length, 1.0)[:, None, None]
@@ -158,7 +158,7 @@ def test_rank_is_that_of_the_folded_map_per_length(name, k, count):
 def test_both_roads_lead_to_the_same_margin(name, k, count):
     grasp = random_grasps(name, seed=8, k=k)[:count]
     direct = jg.wrench_resistance(grasp)
-    by_lmi = np.asarray(jg.lmi_margin(grasp, tolerance=1e-9))
+    by_lmi = np.asarray(jg.lmi.lmi_margin(grasp, tolerance=1e-9))
     margin = np.asarray(direct.margin)
     np.testing.assert_array_equal(np.isneginf(margin), np.isneginf(by_lmi))
     finite = np.isfinite(margin)
@@ -185,7 +185,7 @@ def test_a_float32_proof_is_a_proof(verdict_only, count):
     assert (known & yes & (optimum < -1e-8)).sum() == 0
     assert (known & no & full & (optimum > 1e-8)).sum() == 0
     assert (yes | no).mean() > 0.95
-    assert jg.check_certificate(grasp, res).all()
+    assert jg.check(grasp, res).all()
     # The bracket holds to the rounding of float32 itself.
     lower, upper = np.asarray(res.margin, np.float64), np.asarray(res.margin + res.gap, np.float64)
     finite = known & np.isfinite(optimum) & np.isfinite(lower)

@@ -12,12 +12,12 @@ import pyarrow.parquet as pq
 import pytest
 from quick_check import quick
 
-from jaxgrasp import ControllabilityVerdict, Status
+from jaxgrasp import Status
 from jaxgrasp.cli.main import main
 from jaxgrasp.jobs import motion as checking
 from jaxgrasp.jobs import shards
 
-V = ControllabilityVerdict
+V = Status
 pytestmark = pytest.mark.skipif(not jax.config.jax_enable_x64, reason="the command works in float64")
 
 

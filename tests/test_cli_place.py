@@ -66,7 +66,7 @@ def test_the_grasps_in_the_file_hold_when_solved_again(placed):
     )
     found = jg.wrench_resistance(grasp)
     assert (np.asarray(found.status) == jg.Status.RESISTANT).all()
-    assert jg.check_certificate(grasp, found).all()
+    assert jg.check(grasp, found).all()
     table = pq.read_table(file)
     margin, objective = table["margin"].to_numpy(), table["objective"].to_numpy()
     np.testing.assert_allclose(margin, np.asarray(found.margin), atol=1e-8)

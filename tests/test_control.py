@@ -13,7 +13,7 @@ from jaxgrasp.contacts.friction_cones import cone_use, into_cones, nearest_admis
 from jaxgrasp.motion.computed_torque import tracking_error
 from jaxgrasp.motion.regulator import riccati
 
-C = jg.ControlStatus
+C = jg.Status
 RNG = np.random.default_rng(43)
 pytestmark = pytest.mark.skipif(not jax.config.jax_enable_x64, reason="loops are compared in float64")
 
@@ -51,10 +51,20 @@ def loop(grasp, state, rate=10.0, h=0.002, body=PLANAR, reference=None, disturba
     limit = np.broadcast_to(max_normal, (LANES, 3))
     controller = jg.ComputedTorque(jg.Gains.of_rate(rate), max_normal=limit)
     if reference is None:
-        hold = jg.Reference.hold(jg.BodyState.at_rest(2))
+        hold = jg.motion.Reference.hold(jg.BodyState.at_rest(2))
         reference = jax.tree.map(lambda x: jnp.broadcast_to(x, (STEPS, *x.shape)), hold)
     push = np.zeros((STEPS, 3)) if disturbance is None else disturbance
-    return jg.close_loop(grasp, body, controller, state, STEPS, h, reference, push, record=True)
+    return jg.close_loop(
+        grasp,
+        body,
+        controller=controller,
+        state=state,
+        steps=STEPS,
+        timestep=h,
+        reference=reference,
+        disturbance=push,
+        record=True,
+    )
 
 
 # Computed torque ---------------------------------------------------------------------------------------
@@ -120,7 +130,15 @@ def test_joint_torques_stay_under_their_limits():
     J[[index, 2 + index], 0] = 1.0
     limit = np.linspace(0.5, 1.5, LANES) * weight / 0.8
     controller = jg.ComputedTorque(jg.Gains.of_rate(10.0), torque_limits=(J, limit[:, None]))
-    out = jg.close_loop(grasp, PLANAR, controller, rested(np.zeros((LANES, 3))), 200, 0.002, record=True)
+    out = jg.close_loop(
+        grasp,
+        PLANAR,
+        controller=controller,
+        state=rested(np.zeros((LANES, 3))),
+        steps=200,
+        timestep=0.002,
+        record=True,
+    )
     torque = (np.asarray(out.force) @ J)[..., 0]
     assert (torque <= limit * (1 + 1e-9)).all() and slack(grasp, out.force) > -1e-9
     enough, short = limit > 1.01 * weight / 0.8, limit < 0.99 * weight / 0.8
@@ -145,7 +163,7 @@ def test_a_trajectory_is_followed():
     def path(t):
         return jnp.stack([0.02 * jnp.sin(3 * t), 0.01 * (1 - jnp.cos(5 * t)), 0.5 * jnp.sin(2 * t)])
 
-    reference = jg.Reference.along(path, 0.002 * np.arange(STEPS))
+    reference = jg.motion.Reference.along(path, 0.002 * np.arange(STEPS))
     start = rested(np.zeros((LANES, 3)))
     start = jg.BodyState(
         start.position, start.orientation, jnp.broadcast_to(reference.velocity[0], (LANES, 3))
@@ -196,10 +214,10 @@ def test_large_rotations_obey_the_same_linear_equation_and_mujoco_agrees():
     square = rng.normal(size=(2, 6, 6))
     K_p, K_v = (scale * (np.eye(6) + 0.1 * s @ s.T) for scale, s in zip((60.0, 12.0), square, strict=True))
     controller = jg.ComputedTorque(jg.Gains(K_p, K_v))
-    out = jg.close_loop(grasp, body, controller, start, steps, h, record=True)
+    out = jg.close_loop(grasp, body, controller=controller, state=start, steps=steps, timestep=h, record=True)
     assert not np.asarray(out.infeasible).any()
     assert slack_soft(grasp, out.force) > -1e-9
-    at = tracking_error(start, jg.Reference.hold(jg.BodyState.at_rest()))
+    at = tracking_error(start, jg.motion.Reference.hold(jg.BodyState.at_rest()))
     e, rate = np.asarray(at.error), np.asarray(at.rate)
     errors = []
     for _ in range(steps):
@@ -211,8 +229,10 @@ def test_large_rotations_obey_the_same_linear_equation_and_mujoco_agrees():
         size = np.linalg.norm(part, axis=-1)
         assert np.abs(np.asarray(error) - size).max() < 0.005 * size.max()
 
-    plant = jg.mujoco_plant(body, h)
-    other = jg.close_loop(grasp, body, controller, start, steps, h, plant=plant)
+    plant = jg.motion.mujoco_plant(body, timestep=h)
+    other = jg.close_loop(
+        grasp, body, controller=controller, state=start, steps=steps, timestep=h, plant=plant
+    )
     np.testing.assert_allclose(other.final.position, out.final.position, atol=1e-6)
     np.testing.assert_allclose(other.final.orientation, out.final.orientation, atol=1e-6)
 
@@ -230,7 +250,7 @@ def slack_soft(grasp, force):
 def test_the_error_and_its_rate_in_motion():
     """Against scipy's logarithm along two tumbling motions, by finite differences."""
     a, b = random_states(RNG, 10, 3), random_states(RNG, 10, 3)
-    ref = jg.Reference(b.position, b.orientation, b.velocity, jnp.zeros((10, 6)))
+    ref = jg.motion.Reference(b.position, b.orientation, b.velocity, jnp.zeros((10, 6)))
     at = tracking_error(a, ref)
 
     def logs(t):
@@ -250,14 +270,14 @@ def test_references_have_exact_rates():
         return jnp.concatenate([jnp.stack([t, t**2, jnp.sin(t)]), jnp.stack([jnp.sin(t), t, 0.5 * t**2])])
 
     times = jnp.linspace(0, 1, 5)
-    reference, h = jg.Reference.along(path, times), 1e-5
+    reference, h = jg.motion.Reference.along(path, times), 1e-5
 
     def turn(t):
         return Rotation.from_rotvec(np.stack([np.asarray(path(x))[3:] for x in t]))
 
     omega = (turn(times + h) * turn(times - h).inv()).as_rotvec() / (2 * h)
     np.testing.assert_allclose(reference.velocity[:, 3:], omega, atol=1e-8)
-    ahead, behind = jg.Reference.along(path, times + h), jg.Reference.along(path, times - h)
+    ahead, behind = jg.motion.Reference.along(path, times + h), jg.motion.Reference.along(path, times - h)
     np.testing.assert_allclose(
         reference.acceleration, (ahead.velocity - behind.velocity) / (2 * h), atol=1e-8
     )
@@ -319,13 +339,13 @@ BODY = jg.RigidBody(0.2, 1e-4 * np.diag([1.0, 1.2, 1.5])) if jax.config.jax_enab
 def test_an_object_hanging_below_two_fingers_is_brought_to_rest():
     """Rank 5: no computed torque exists. The fingers swing it to rest, above or below their line; not on it."""
     grasp, force = two_fingers([0.02, 0.01, -0.02, 0.0])
-    reg = jg.regulator(grasp, BODY, 0.002, force=force, effort=3.0)
+    reg = jg.regulator(grasp, BODY, timestep=0.002, force=force, effort=3.0)
     assert reg.stabilizes.tolist() == [True, True, True, False]
     swing = np.zeros((4, 6))
     swing[:, 3:] = [0.05, 0.02, -0.03]
     swing[:, 0] = 0.002
     start = jg.BodyState.at_rest(3, (4,)).displaced(jnp.asarray(swing))
-    out = jg.close_loop(grasp, BODY, reg, start, 6000, 0.002, record=True)
+    out = jg.close_loop(grasp, BODY, controller=reg, state=start, steps=6000, timestep=0.002, record=True)
     assert float(out.cone_use.max()) <= 1 + 1e-9
     assert np.asarray(out.position_error)[-1, :3].max() < 1e-5
     assert np.asarray(out.orientation_error)[-1, :3].max() < 1e-4
@@ -334,8 +354,8 @@ def test_an_object_hanging_below_two_fingers_is_brought_to_rest():
     # the forces that would be needed from far away leave the cones: said, and cut
     far = start.displaced(jnp.zeros((4, 6)), jnp.asarray([2.0, 1, 1, 0, 0, 0]))
     _, light = two_fingers([0.02, 0.01, -0.02, 0.0], 2.2)
-    reg = jg.regulator(grasp, BODY, 0.002, force=light, effort=3.0)
-    rough = jg.close_loop(grasp, BODY, reg, far, 6000, 0.002, record=True)
+    reg = jg.regulator(grasp, BODY, timestep=0.002, force=light, effort=3.0)
+    rough = jg.close_loop(grasp, BODY, controller=reg, state=far, steps=6000, timestep=0.002, record=True)
     assert C.PROJECTED.value in np.asarray(rough.status)[:, 0]
     assert float(rough.cone_use.max()) <= 1 + 1e-9
 
@@ -348,7 +368,7 @@ def test_regulators_say_where_there_is_none():
     reg = jg.regulator(grasp, jg.RigidBody(mass, inertia), force=force)
     assert reg.stabilizes.tolist() == [True, False, False]
     assert np.isfinite(reg.gain).all()
-    assert [jg.OperatingPoint(int(p)).name for p in reg.point] == ["NON_MARGINAL", "NOT_BALANCED", "INVALID"]
+    assert [jg.Status(int(p)).name for p in reg.point] == ["NON_MARGINAL", "NOT_BALANCED", "INVALID"]
 
 
 # Bad input ----------------------------------------------------------------------------------------------
@@ -358,24 +378,33 @@ def test_wrong_settings_raise():
     grasp, state = ring(), rested(np.zeros((LANES, 3)))
     control = jg.ComputedTorque(jg.Gains.of_rate(10.0))
     with pytest.raises(ValueError, match="too large for these gains"):
-        jg.close_loop(grasp, PLANAR, jg.ComputedTorque(jg.Gains.of_rate(500.0)), state, 10, 0.01)
+        jg.close_loop(
+            grasp,
+            PLANAR,
+            controller=jg.ComputedTorque(jg.Gains.of_rate(500.0)),
+            state=state,
+            steps=10,
+            timestep=0.01,
+        )
     with pytest.raises(ValueError, match="must be a ComputedTorque"):
-        jg.close_loop(grasp, PLANAR, jg.Gains.of_rate(1.0), state, 10)
+        jg.close_loop(grasp, PLANAR, controller=jg.Gains.of_rate(1.0), state=state, steps=10)
     with pytest.raises(ValueError, match="all planar"):
-        jg.close_loop(grasp, BODY, control, state, 10)
+        jg.close_loop(grasp, BODY, controller=control, state=state, steps=10)
     with pytest.raises(ValueError, match="disturbance must have shape"):
-        jg.close_loop(grasp, PLANAR, control, state, 10, disturbance=np.zeros((9, 3)))
+        jg.close_loop(grasp, PLANAR, controller=control, state=state, steps=10, disturbance=np.zeros((9, 3)))
     with pytest.raises(ValueError, match="one a step"):
-        reference = jg.Reference.along(lambda t: jnp.stack([t, t, t]), jnp.arange(7.0))
-        jg.close_loop(grasp, PLANAR, control, state, 10, reference=reference)
+        reference = jg.motion.Reference.along(lambda t: jnp.stack([t, t, t]), jnp.arange(7.0))
+        jg.close_loop(grasp, PLANAR, controller=control, state=state, steps=10, reference=reference)
     with pytest.raises(ValueError, match="6 numbers"):
-        jg.Reference.along(lambda t: jnp.stack([t, t]), jnp.arange(7.0))
+        jg.motion.Reference.along(lambda t: jnp.stack([t, t]), jnp.arange(7.0))
     for wrong in ((-1.0, 1.0), (np.diag([1.0, -1, 1]), 1.0), (np.ones((2, 3)), 1.0)):
         with pytest.raises(ValueError, match="must be"):
             jg.Gains(*wrong)
     two, force = two_fingers([0.02])
-    reg = jg.regulator(two, BODY, 0.002, force=force)
+    reg = jg.regulator(two, BODY, timestep=0.002, force=force)
     with pytest.raises(ValueError, match="made for steps"):
-        jg.close_loop(two, BODY, reg, jg.BodyState.at_rest(3, (1,)), 10, 0.001)
+        jg.close_loop(
+            two, BODY, controller=reg, state=jg.BodyState.at_rest(3, (1,)), steps=10, timestep=0.001
+        )
     with pytest.raises(ValueError, match="effort must be"):
         jg.regulator(two, BODY, force=force, effort=0.0)

@@ -13,7 +13,7 @@ import jaxgrasp as jg
 from jaxgrasp.core.tolerances import rank_tolerance
 from jaxgrasp.motion.linearization import scaled_system
 
-V = jg.ControllabilityVerdict
+V = jg.Status
 RNG = np.random.default_rng(41)
 BODY = jg.RigidBody(0.2, 1e-4 * np.diag([1.0, 1.2, 1.5])) if jax.config.jax_enable_x64 else None
 X, Y, Z = np.eye(3)
@@ -62,7 +62,7 @@ def stacked(cases, k, dimension=3):
 
 def carrying(grasp, load):
     """Forces that balance ``load``, squeezed by 50 times as much where the grasp can be squeezed."""
-    G = np.asarray(jg.folded_grasp_map(grasp))
+    G = np.asarray(jg.contacts.folded_grasp_map(grasp))
     n = grasp.model.force_size(grasp.dimension)
     push = np.zeros((len(G), grasp.contacts, n))
     push[..., grasp.model.normal_index(grasp.dimension)] = 50 * np.linalg.norm(load)
@@ -85,7 +85,7 @@ def test_the_equilibrium_is_found_when_no_forces_are_given(answers):
     found = jg.controllability(grasp, BODY)
     for name in ("verdict", "rank", "reduced_rank", "grasp_rank"):
         np.testing.assert_array_equal(getattr(found, name), getattr(given, name), err_msg=name)
-    assert int(found.point[list(CASES).index("from above")]) == jg.OperatingPoint.NO_EQUILIBRIUM
+    assert int(found.point[list(CASES).index("from above")]) == jg.Status.NO_EQUILIBRIUM
     weightless = jg.controllability(grasp, BODY, gravity=(0, 0, 0))
     names = list(CASES)
     resistant = [i for i, n in enumerate(names) if CASES[n][-1] == V.RESISTANT]
@@ -120,8 +120,8 @@ def test_the_uncontrollable_motion_is_the_one_to_picture(answers):
         np.testing.assert_allclose(found.uncontrollable[names.index(name)], wanted, atol=1e-9)
     # it is one: neither the forces nor their turning with the body do work along it
     low = np.flatnonzero(np.asarray(found.verdict) == V.NOT_CONTROLLABLE)
-    G = np.asarray(jg.folded_grasp_map(grasp))[low]
-    linear = jg.linearize(grasp, BODY, found.force)
+    G = np.asarray(jg.contacts.folded_grasp_map(grasp))[low]
+    linear = jg.linearize(grasp, BODY, force=found.force)
     M = np.diag([0.2] * 3 + [1e-4, 1.2e-4, 1.5e-4])
     turning = M @ np.asarray(linear.A)[low, 6:, :6] @ np.asarray(linear.B)[low, 6:]
     xi = np.asarray(found.uncontrollable)[low]
@@ -133,7 +133,7 @@ def test_the_reason_is_told_in_words(answers):
     _, found = answers
 
     def told(name):
-        return jg.explain_controllability(found, list(CASES).index(name), [0.1, 0, 0])
+        return jg.report.explain_controllability(found, list(CASES).index(name), [0.1, 0, 0])
 
     text = told("two hard, line through, horizontal")
     assert "Not controllable to first order" in text and "rank 10 of 12" in text
@@ -166,7 +166,7 @@ def least_squeezed(grasp, force, lane):
     """The forces of ``lane`` with just so much squeeze that some contact is at the edge of its cone, by bisection."""
     load = np.array([0, 0, -0.2 * 9.81, 0, 0, 0])
     G = np.asarray(jg.grasp_map(grasp))[lane]
-    particular = -np.linalg.pinv(np.asarray(jg.folded_grasp_map(grasp))[lane], rcond=1e-10) @ load
+    particular = -np.linalg.pinv(np.asarray(jg.contacts.folded_grasp_map(grasp))[lane], rcond=1e-10) @ load
     scaling = np.asarray(grasp.model.scaling(3))[lane].ravel()
     particular, low, high = particular * scaling, 0.0, 1.0
     for _ in range(60):
@@ -183,15 +183,15 @@ def test_given_forces_are_judged_and_change_no_rank(answers):
     grasp, found = answers
     lane = list(CASES).index("tetrahedron")
     force = np.asarray(found.force)
-    point = jg.linearize(grasp, BODY, force).point
+    point = jg.linearize(grasp, BODY, force=force).point
     there = np.asarray(found.verdict) != V.NO_EQUILIBRIUM
     np.testing.assert_array_equal(np.asarray(point)[there], np.asarray(found.point)[there])
-    assert set(np.asarray(point)[~there].tolist()) == {jg.OperatingPoint.NOT_BALANCED.value}
-    pulling = jg.linearize(grasp, BODY, -force)
-    assert int(pulling.point[lane]) == jg.OperatingPoint.NOT_BALANCED
-    edge = jg.linearize(grasp, BODY, least_squeezed(grasp, force, lane))
-    assert int(edge.point[lane]) == jg.OperatingPoint.MARGINAL
-    np.testing.assert_array_equal(edge.A[lane], jg.linearize(grasp, BODY, force).A[lane])
+    assert set(np.asarray(point)[~there].tolist()) == {jg.Status.NOT_BALANCED.value}
+    pulling = jg.linearize(grasp, BODY, force=-force)
+    assert int(pulling.point[lane]) == jg.Status.NOT_BALANCED
+    edge = jg.linearize(grasp, BODY, force=least_squeezed(grasp, force, lane))
+    assert int(edge.point[lane]) == jg.Status.MARGINAL
+    np.testing.assert_array_equal(edge.A[lane], jg.linearize(grasp, BODY, force=force).A[lane])
 
 
 # A and B ----------------------------------------------------------------------------------------------
@@ -213,8 +213,8 @@ def test_A_and_B_are_the_derivatives_of_the_motion(dimension):
 
     def motion(x, f):
         state = jg.BodyState.at_rest(dimension).displaced(x[:m], x[m:])
-        wrench = jg.world_grasp_map(grasp, state.orientation) @ f
-        return jnp.concatenate([state.velocity, jg.acceleration(body, state, wrench, gravity)])
+        wrench = jg.motion.world_grasp_map(grasp, state.orientation) @ f
+        return jnp.concatenate([state.velocity, jg.motion.acceleration(body, state, wrench, gravity)])
 
     A, B = jax.jacfwd(motion, argnums=(0, 1))(jnp.zeros(2 * m), jnp.asarray(force))
     from jaxgrasp.motion.linearization import _blocks
@@ -230,7 +230,7 @@ def test_the_factor_g_is_there(answers):
     grasp, found = answers
     lane = list(CASES).index("tetrahedron")
     for g in (9.81, 1.62):
-        A = jg.linearize(grasp, BODY, found.force * (g / 9.81), (0, 0, -g)).A[lane]
+        A = jg.linearize(grasp, BODY, force=found.force * (g / 9.81), gravity=(0, 0, -g)).A[lane]
         np.testing.assert_allclose(A[6:9, 3:6], g * np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 0]]), atol=1e-12)
 
 
@@ -240,7 +240,7 @@ def test_derivatives_pass_through(answers):
     def size(position, mass):
         body = jg.RigidBody(mass, BODY.inertia)
         moved = jg.Grasp(position, grasp.normal, grasp.model, grasp.active)
-        return jnp.sum(jg.linearize(moved, body, found.force * (mass / 0.2)).B ** 2)
+        return jnp.sum(jg.linearize(moved, body, force=found.force * (mass / 0.2)).B ** 2)
 
     by_position, by_mass = jax.jit(jax.grad(size, argnums=(0, 1)))(grasp.position, jnp.asarray(0.2))
     h = 5e-5
@@ -332,7 +332,7 @@ def test_ranks_are_those_of_exact_arithmetic():
     reduced = np.concatenate([system.B_c, system.A_c @ system.B_c], axis=2)
     values = np.linalg.svd(reduced, compute_uv=False)
     found = (values > rank_tolerance("float64") * values[:, :1]).sum(1)
-    G = np.asarray(jg.folded_grasp_map(grasp))
+    G = np.asarray(jg.contacts.folded_grasp_map(grasp))
     for i in range(n):
         B = [[Fraction(x).limit_denominator(1000) for x in row] for row in G[i]]
         B = B[:3] + [[x / int(moments[i, j]) for x in B[3 + j]] for j in range(3)]
@@ -375,7 +375,7 @@ def test_the_gramian_is_its_integral():
         w / 2 * 1.5 * (E := expm(A * 1.5 * (x + 1) / 2)) @ B @ B.T @ E.T
         for x, w in zip(nodes, weights, strict=True)
     )
-    np.testing.assert_allclose(jg.gramian(jnp.asarray(A), jnp.asarray(B), 1.5), wanted, atol=1e-12)
+    np.testing.assert_allclose(jg.motion.gramian(jnp.asarray(A), jnp.asarray(B), 1.5), wanted, atol=1e-12)
 
 
 def test_the_weakest_direction_costs_its_effort(answers):
@@ -392,7 +392,7 @@ def test_the_weakest_direction_costs_its_effort(answers):
     unit = np.concatenate([np.full(3, system.length), np.ones(3)])
     state = np.asarray(found.weakest[lane]) / np.concatenate([unit, unit / system.time])
     assert np.linalg.norm(state) == pytest.approx(1.0)
-    W = np.asarray(jg.gramian(jnp.asarray(A), jnp.asarray(B)))
+    W = np.asarray(jg.motion.gramian(jnp.asarray(A), jnp.asarray(B)))
     nodes, weights = np.polynomial.legendre.leggauss(10)
     costate, reached, energy = np.linalg.solve(W, state), 0, 0
     for t, w in zip((nodes + 1) / 2, weights / 2, strict=True):
@@ -415,7 +415,7 @@ def test_bad_lanes_say_so_and_harm_no_other(answers):
     gravity = np.tile([0, 0, -9.81], (n, 1))
     gravity[3, 0] = np.nan
     broken = jg.Grasp(position, grasp.normal, grasp.model, grasp.active)
-    other = jg.controllability(broken, jg.RigidBody(mass, inertia), gravity, found.force)
+    other = jg.controllability(broken, jg.RigidBody(mass, inertia), gravity=gravity, force=found.force)
     assert set(np.asarray(other.verdict)[:4].tolist()) == {V.INVALID.value}
     assert np.isnan(np.asarray(other.rank)[:4]).all()
     for name in ("verdict", "rank", "singular_values", "uncontrollable", "effort", "force", "point"):
@@ -433,9 +433,9 @@ def test_wrong_structure_raises():
             stacked([CASES["tetrahedron"]] * 3, 4), jg.RigidBody(np.ones(2), np.stack([np.eye(3)] * 2))
         )
     with pytest.raises(ValueError, match="force must have shape"):
-        jg.linearize(grasp, BODY, np.zeros(5))
+        jg.linearize(grasp, BODY, force=np.zeros(5))
     with pytest.raises(ValueError, match="gravity must be a vector of 3"):
-        jg.linearize(grasp, BODY, np.zeros(16), gravity=9.81)
+        jg.linearize(grasp, BODY, force=np.zeros(16), gravity=9.81)
 
 
 # The plane --------------------------------------------------------------------------------------------

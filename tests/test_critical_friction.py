@@ -33,9 +33,9 @@ def test_both_ends_carry_their_verdicts():
     grasp = planar_pair(angle, -0.3 * angle, 0.5)
     out = jg.critical_friction(grasp)
     for factor, status in ((out.lower, Status.NOT_RESISTANT), (out.upper, Status.RESISTANT)):
-        ends = jg.with_friction_factor(grasp, factor)
+        ends = jg.quality.with_friction_factor(grasp, factor)
         verdict = jg.wrench_resistance(ends)
-        assert jg.check_certificate(ends, verdict).all()
+        assert jg.check(ends, verdict).all()
         assert (np.asarray(verdict.status) == status).mean() > 0.9
         assert not (np.asarray(verdict.status) == (3 - status)).any()  # never the other one
 
@@ -72,12 +72,12 @@ def test_a_sweep_of_factors():
     angle = np.linspace(0.1, 1.2, 6)
     grasp = planar_pair(angle, 0.0 * angle, 0.5)
     factors = np.array([0.1, 1.0, 2.0, 8.0])
-    out = jg.friction_sweep(grasp, factors)
+    out = jg.quality.friction_sweep(grasp, factors)
     assert out.status.shape == (6, 4)
     expected = np.tan(angle)[:, None] / 0.5 < factors
     np.testing.assert_array_equal(np.asarray(out.status) == Status.RESISTANT, expected)
     with pytest.raises(ValueError, match="factors must be a list of numbers"):
-        jg.friction_sweep(grasp, factors[None])
+        jg.quality.friction_sweep(grasp, factors[None])
 
 
 @pytest.mark.slow

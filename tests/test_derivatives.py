@@ -35,7 +35,13 @@ def optimum(make, smoothing=0.0):
     def run(x):
         limits = (x["jacobian"], x["torque"]) if "jacobian" in x else None
         out = jg.optimize_forces(
-            grasp_of(x), x["wrench"], make(x), x.get("cap"), limits, tolerance=1e-12, smoothing=smoothing
+            grasp_of(x),
+            x["wrench"],
+            criterion=make(x),
+            max_normal=x.get("cap"),
+            torque_limits=limits,
+            tolerance=1e-12,
+            smoothing=smoothing,
         )
         values = {"value": out.cost, "bound": out.bound, "force": out.force, "twist": out.load_twist}
         if limits is not None:
@@ -260,10 +266,10 @@ def test_a_degenerate_optimum_says_so():
     grasp = jg.Grasp(position, -position, jg.HardFinger(0.5))
     load = np.array([0, 0, -1.0, 0, 0, 0])
     for criterion, unique in ((jg.Gentlest(), False), (jg.LeastNorm(), True)):
-        out = jg.optimize_forces(grasp, load, criterion)
+        out = jg.optimize_forces(grasp, load, criterion=criterion)
         np.testing.assert_allclose(np.asarray(out.force).reshape(4, 3)[:, 2], 0.5, rtol=1e-6)
         assert bool(out.smooth) == unique
-    pull = jg.optimize_forces(grasp, np.array([0.3, 0.1, -1.0, 0, 0, 0]), jg.LeastNorm())
+    pull = jg.optimize_forces(grasp, np.array([0.3, 0.1, -1.0, 0, 0, 0]), criterion=jg.LeastNorm())
     assert bool(pull.smooth)
 
 
@@ -278,7 +284,11 @@ def test_lanes_without_an_optimum_have_derivative_zero_and_harm_no_other():
     def gradient(x):
         def total(x):
             out = jg.optimize_forces(
-                grasp_of(x), x["wrench"], jg.Gentlest(), x["cap"], (x["jacobian"], x["torque"])
+                grasp_of(x),
+                x["wrench"],
+                criterion=jg.Gentlest(),
+                max_normal=x["cap"],
+                torque_limits=(x["jacobian"], x["torque"]),
             )
             return jnp.sum(jnp.where(out.status == Status.OPTIMAL, out.cost, 0.0)), out.status
 

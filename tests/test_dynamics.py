@@ -102,10 +102,10 @@ def test_the_equation_of_motion_holds(dimension, dtype):
     position = RNG.normal(size=(n, k, dimension)).astype(dtype)
     grasp = jg.Grasp(position, -position, jg.HardFinger(jnp.asarray(0.5, dtype)))
     force = jnp.asarray(RNG.normal(size=(n, k * dimension)).astype(dtype))
-    wrench = jnp.einsum("nij,nj->ni", jg.world_grasp_map(grasp, state.orientation), force)
-    qdd = jg.acceleration(body, state, wrench)
-    left = jnp.einsum("nij,nj->ni", jg.mass_matrix(body, state.orientation), qdd)
-    left += jg.coriolis(body, state) + jg.gravity_term(body)
+    wrench = jnp.einsum("nij,nj->ni", jg.motion.world_grasp_map(grasp, state.orientation), force)
+    qdd = jg.motion.acceleration(body, state, wrench)
+    left = jnp.einsum("nij,nj->ni", jg.motion.mass_matrix(body, state.orientation), qdd)
+    left += jg.motion.coriolis(body, state) + jg.motion.gravity_term(body)
     np.testing.assert_allclose(left, wrench, atol=50 * close(dtype))
 
 
@@ -116,15 +116,15 @@ def test_the_terms_are_newtons_and_eulers(dtype):
     inertia = R @ np.asarray(body.inertia, float) @ R.transpose(0, 2, 1)
     omega = np.asarray(state.velocity[:, 3:], float)
     torque = np.cross(omega, np.einsum("nij,nj->ni", inertia, omega))
-    np.testing.assert_allclose(jg.coriolis(body, state)[:, 3:], torque, atol=close(dtype))
-    np.testing.assert_allclose(jg.coriolis(body, state)[:, :3], 0)
-    M = jg.mass_matrix(body, state.orientation)
+    np.testing.assert_allclose(jg.motion.coriolis(body, state)[:, 3:], torque, atol=close(dtype))
+    np.testing.assert_allclose(jg.motion.coriolis(body, state)[:, :3], 0)
+    M = jg.motion.mass_matrix(body, state.orientation)
     np.testing.assert_allclose(M[:, 3:, 3:], inertia, atol=close(dtype))
     np.testing.assert_allclose(
         M[:, :3, :3], np.asarray(body.mass)[:, None, None] * np.eye(3), atol=close(dtype)
     )
     np.testing.assert_allclose(M[:, :3, 3:], 0)
-    weight = jg.gravity_term(body, (0.0, 0.0, -10.0))
+    weight = jg.motion.gravity_term(body, (0.0, 0.0, -10.0))
     np.testing.assert_allclose(weight[:, 2], 10 * np.asarray(body.mass), rtol=1e-6)
 
 
@@ -134,7 +134,7 @@ def test_contact_forces_turn_with_the_body(dtype):
     quarter = turned(jg.BodyState.at_rest(3, (), dtype).orientation, jnp.asarray([0, 0, np.pi / 2], dtype))
     G, R = np.asarray(jg.grasp_map(grasp)), np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
     wanted = np.concatenate([R @ G[:3], R @ G[3:]])
-    np.testing.assert_allclose(jg.world_grasp_map(grasp, quarter), wanted, atol=close(dtype))
+    np.testing.assert_allclose(jg.motion.world_grasp_map(grasp, quarter), wanted, atol=close(dtype))
 
 
 def test_a_free_body_keeps_momentum_and_nearly_its_energy(dtype):
@@ -144,10 +144,10 @@ def test_a_free_body_keeps_momentum_and_nearly_its_energy(dtype):
     none, h = jnp.zeros((4, 6)), 1e-4
 
     def momentum(s):
-        return jnp.einsum("nij,nj->ni", jg.mass_matrix(body, s.orientation), s.velocity)
+        return jnp.einsum("nij,nj->ni", jg.motion.mass_matrix(body, s.orientation), s.velocity)
 
     def step(_, s):
-        return jg.advance(body, s, none, h, gravity=(0.0, 0.0, 0.0))
+        return jg.motion.advance(body, s, none, h, gravity=(0.0, 0.0, 0.0))
 
     after = jax.jit(lambda s: jax.lax.fori_loop(0, 1000, step, s))(state)
     scale = np.abs(momentum(state)).max()
@@ -161,7 +161,7 @@ def test_falling_is_exact(dtype):
     body = jg.RigidBody(jnp.asarray(0.2, dtype), 1e-4 * jnp.eye(3, dtype=dtype))
     state = jg.BodyState.at_rest(3, (), dtype)
     for _ in range(10):
-        state = jg.advance(body, state, jnp.zeros(6, dtype), 0.01)
+        state = jg.motion.advance(body, state, jnp.zeros(6, dtype), 0.01)
     np.testing.assert_allclose(state.velocity, [0, 0, -0.981, 0, 0, 0], atol=1e-6)
     np.testing.assert_allclose(state.position, [0, 0, -9.81 * 0.01**2 * 55], atol=1e-6)
 
@@ -186,7 +186,7 @@ def test_derivatives_reach_mass_and_inertia(dtype):
 
     def speed(mass, inertia):
         body = jg.RigidBody(mass, inertia)
-        return jnp.sum(jg.acceleration(body, state, jnp.ones(6, dtype)) ** 2)
+        return jnp.sum(jg.motion.acceleration(body, state, jnp.ones(6, dtype)) ** 2)
 
     grads = jax.grad(speed, argnums=(0, 1))(jnp.asarray(2.0, dtype), inertia)
     h = 1e-6 if dtype == "float64" else 1e-2
@@ -257,7 +257,7 @@ def test_wrong_meshes_raise():
 def test_gravity_must_be_a_vector(dtype):
     body = jg.RigidBody(1.0, np.eye(3))
     with pytest.raises(ValueError, match="gravity must be a vector of 3"):
-        jg.gravity_term(body, (0.0, -9.81))
+        jg.motion.gravity_term(body, (0.0, -9.81))
 
 
 def test_rotating_everything_rotates_the_answer(dtype):
@@ -274,6 +274,8 @@ def test_rotating_everything_rotates_the_answer(dtype):
         quaternion_product(jnp.broadcast_to(jnp.asarray(q), (3, 4)), state.orientation),
         state.velocity @ both.T,
     )
-    first = jg.acceleration(body, state, jnp.asarray(wrench), g)
-    second = jg.acceleration(body, moved, jnp.asarray(wrench @ both.T), jnp.asarray(turn.astype(dtype) @ g))
+    first = jg.motion.acceleration(body, state, jnp.asarray(wrench), g)
+    second = jg.motion.acceleration(
+        body, moved, jnp.asarray(wrench @ both.T), jnp.asarray(turn.astype(dtype) @ g)
+    )
     np.testing.assert_allclose(second, first @ both.T, atol=50 * close(dtype))

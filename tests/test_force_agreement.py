@@ -59,7 +59,9 @@ def test_clarabel_agrees(criterion, runs):
     make, parameter = CRITERIA[criterion]
     for run, (name, limits, count) in enumerate(runs):
         grasp, components, wrench, cap, limit = problems(name, limits, count, seed=30 + run)
-        out = jg.optimize_forces(grasp, wrench, make(parameter), cap, limit)
+        out = jg.optimize_forces(
+            grasp, wrench, criterion=make(parameter), max_normal=cap, torque_limits=limit
+        )
         status, cost = np.asarray(out.status), np.asarray(out.cost)
         answer, best = oracle(grasp, components, wrench, criterion, parameter, cap, limit)
         optimal, infeasible = status == Status.OPTIMAL, status == Status.INFEASIBLE
@@ -77,7 +79,9 @@ def test_clarabel_agrees(criterion, runs):
             f"{(answer == 'unknown').sum()} unknown to Clarabel, {stalled.sum()} stalled "
             f"({(stalled & (answer != 'unknown')).sum()} of them known to it), {contradictions.sum()} contradictions"
         )
-        accepted = jg.check_certificate(grasp, out)
+        accepted = jg.check(
+            grasp, out, wrench=wrench, criterion=make(parameter), max_normal=cap, torque_limits=limit
+        )
         assert np.flatnonzero(~accepted).size == 0
         assert set(np.unique(status)) <= {Status.OPTIMAL, Status.INFEASIBLE, Status.STALLED}
         assert contradictions.sum() == 0

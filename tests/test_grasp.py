@@ -116,7 +116,7 @@ def test_planar_map_against_hand_written_values():
     expected = [[0, -1, 1, 0], [1, 0, 0, 1], [2, 1, -3, -1]]
     np.testing.assert_allclose(jg.grasp_map(grasp), expected, atol=1e-7)
     folded = np.array(expected) * [0.5, 1, 0.5, 1]
-    np.testing.assert_allclose(jg.folded_grasp_map(grasp), folded, atol=1e-7)
+    np.testing.assert_allclose(jg.contacts.folded_grasp_map(grasp), folded, atol=1e-7)
     frictionless = jg.Grasp([[2.0, 1.0], [-1.0, 3.0]], [[-1.0, 0.0], [0.0, 2.0]], jg.Frictionless())
     np.testing.assert_allclose(jg.grasp_map(frictionless), np.array(expected)[:, 1::2], atol=1e-7)
 
@@ -135,7 +135,7 @@ def test_spatial_map_against_hand_written_values():
         ]
     )
     np.testing.assert_allclose(jg.grasp_map(grasp), expected, atol=1e-7)
-    np.testing.assert_allclose(jg.folded_grasp_map(grasp), expected * [0.5, 0.5, 1, 0.25], atol=1e-7)
+    np.testing.assert_allclose(jg.contacts.folded_grasp_map(grasp), expected * [0.5, 0.5, 1, 0.25], atol=1e-7)
     hard = jg.Grasp([[1.0, 2.0, 3.0]], [[0.0, 0.0, 5.0]], jg.HardFinger(0.5))
     np.testing.assert_allclose(jg.grasp_map(hard), expected[:, :3], atol=1e-7)
 
@@ -169,13 +169,18 @@ def test_rank_is_invariant_and_the_wrench_covariant_under_rotation(model, dimens
     wrench[:dimension, :dimension] = R
     if dimension == 3:
         wrench[3:, 3:] = R
-    A, B = wrench @ np.asarray(jg.folded_grasp_map(before)), np.asarray(jg.folded_grasp_map(after))
+    A, B = (
+        wrench @ np.asarray(jg.contacts.folded_grasp_map(before)),
+        np.asarray(jg.contacts.folded_grasp_map(after)),
+    )
     np.testing.assert_allclose(
         A @ np.swapaxes(A, -1, -2), B @ np.swapaxes(B, -1, -2), atol=10 * tolerance(dtype)
     )
     np.testing.assert_array_equal(jg.grasp_rank(before), jg.grasp_rank(after))
     np.testing.assert_allclose(
-        jg.grasp_singular_values(before), jg.grasp_singular_values(after), atol=10 * tolerance(dtype)
+        jg.contacts.grasp_singular_values(before),
+        jg.contacts.grasp_singular_values(after),
+        atol=10 * tolerance(dtype),
     )
 
 
@@ -184,7 +189,7 @@ def test_tangent_spin_turns_tangential_columns_among_themselves(dtype):
     position = np.array([[0.3, -0.2, 0.1]], dtype)
     above, below = (np.array([[0.6, 0.8, z]], dtype) for z in (1e-7, -1e-7))
     grasps = [jg.Grasp(position, n, jg.SoftFinger(0.4, 0.3)) for n in (above, below)]
-    first, second = (np.asarray(jg.folded_grasp_map(g)) for g in grasps)
+    first, second = (np.asarray(jg.contacts.folded_grasp_map(g)) for g in grasps)
     assert np.max(np.abs(first - second)) > 0.1
     np.testing.assert_allclose(first @ first.T, second @ second.T, atol=1e-6)
     spin = first.T @ np.linalg.pinv(first @ first.T, rcond=1e-5) @ second
@@ -198,7 +203,9 @@ def test_rank_and_singular_values_have_no_unit(model, dimension, dtype):
     metres, millimetres = jg.Grasp(position, normal, model), jg.Grasp(1e3 * position, normal, scaled)
     np.testing.assert_array_equal(jg.grasp_rank(metres), jg.grasp_rank(millimetres))
     np.testing.assert_allclose(
-        jg.grasp_singular_values(metres), jg.grasp_singular_values(millimetres), atol=10 * tolerance(dtype)
+        jg.contacts.grasp_singular_values(metres),
+        jg.contacts.grasp_singular_values(millimetres),
+        atol=10 * tolerance(dtype),
     )
 
 
@@ -206,14 +213,15 @@ def test_mixed_grasps_are_what_their_coefficients_say(dtype):
     position, normal = contacts(5, (6, 3), 3, dtype)
     zero_torsion = jg.Grasp(position, normal, jg.SoftFinger(0.4, 0.0))
     hard = jg.Grasp(position, normal, jg.HardFinger(0.4))
-    A = np.asarray(jg.folded_grasp_map(zero_torsion)).reshape(6, 6, 3, 4)
+    A = np.asarray(jg.contacts.folded_grasp_map(zero_torsion)).reshape(6, 6, 3, 4)
     np.testing.assert_array_equal(A[..., 3], 0.0)
-    np.testing.assert_array_equal(A[..., :3].reshape(6, 6, 9), jg.folded_grasp_map(hard))
+    np.testing.assert_array_equal(A[..., :3].reshape(6, 6, 9), jg.contacts.folded_grasp_map(hard))
     np.testing.assert_array_equal(jg.grasp_rank(zero_torsion), jg.grasp_rank(hard))
     bare = jg.Grasp(position, normal, jg.SoftFinger(0.0, 0.0))
     frictionless = jg.Grasp(position, normal, jg.Frictionless())
     np.testing.assert_array_equal(
-        np.asarray(jg.folded_grasp_map(bare)).reshape(6, 6, 3, 4)[..., 2], jg.folded_grasp_map(frictionless)
+        np.asarray(jg.contacts.folded_grasp_map(bare)).reshape(6, 6, 3, 4)[..., 2],
+        jg.contacts.folded_grasp_map(frictionless),
     )
     np.testing.assert_array_equal(jg.grasp_rank(bare), 3)
     np.testing.assert_array_equal(jg.grasp_rank(bare), jg.grasp_rank(frictionless))
@@ -222,7 +230,9 @@ def test_mixed_grasps_are_what_their_coefficients_say(dtype):
 def test_per_contact_coefficients(dtype):
     position, normal = contacts(6, (3,), 3, dtype)
     mu = np.array([0.0, 0.5, 1.0], dtype)
-    A = np.asarray(jg.folded_grasp_map(jg.Grasp(position, normal, jg.HardFinger(mu)))).reshape(6, 3, 3)
+    A = np.asarray(jg.contacts.folded_grasp_map(jg.Grasp(position, normal, jg.HardFinger(mu)))).reshape(
+        6, 3, 3
+    )
     G = np.asarray(jg.grasp_map(jg.Grasp(position, normal, jg.HardFinger(9.0)))).reshape(6, 3, 3)
     np.testing.assert_allclose(A[..., :2], G[..., :2] * mu[:, None], atol=tolerance(dtype))
     np.testing.assert_array_equal(A[..., 2], G[..., 2])
@@ -242,7 +252,7 @@ def test_padding_changes_nothing_whatever_it_holds(model, dimension, dtype):
     )
     plain = jg.Grasp(position, normal, model)
     n = model.force_size(dimension)
-    for of in (jg.grasp_map, jg.folded_grasp_map):
+    for of in (jg.grasp_map, jg.contacts.folded_grasp_map):
         np.testing.assert_array_equal(of(padded)[..., : 3 * n], of(plain))
         np.testing.assert_array_equal(of(padded)[..., 3 * n :], 0.0)
     np.testing.assert_array_equal(jg.grasp_rank(padded), jg.grasp_rank(plain))
@@ -290,10 +300,10 @@ def test_internal_force_part_is_a_projection_onto_the_squeezes(dtype):
     position, normal = contacts(10, (6, 4), 3, dtype)
     grasp = jg.Grasp(position, normal, jg.HardFinger(0.4))
     force = jnp.asarray(np.random.default_rng(11).normal(size=(6, 12)), dtype)
-    part = jg.internal_force_part(grasp, force)
+    part = jg.contacts.internal_force_part(grasp, force)
     G = np.asarray(jg.grasp_map(grasp))
     np.testing.assert_allclose(np.einsum("bij,bj->bi", G, part), 0.0, atol=20 * tolerance(dtype))
-    np.testing.assert_allclose(jg.internal_force_part(grasp, part), part, atol=20 * tolerance(dtype))
+    np.testing.assert_allclose(jg.contacts.internal_force_part(grasp, part), part, atol=20 * tolerance(dtype))
     rest = np.asarray(force - part)
     np.testing.assert_allclose(np.sum(rest * np.asarray(part), -1), 0.0, atol=20 * tolerance(dtype))
     expected = np.asarray(force) - np.einsum("bij,bj->bi", np.linalg.pinv(G) @ G, force)
@@ -309,10 +319,10 @@ def test_jit_and_vmap_agree_with_the_batch_and_keep_the_dtype(model, dimension, 
         V = jg.null_space(grasp)
         return (
             jg.grasp_map(grasp),
-            jg.folded_grasp_map(grasp),
-            jg.grasp_singular_values(grasp),
+            jg.contacts.folded_grasp_map(grasp),
+            jg.contacts.grasp_singular_values(grasp),
             V @ jnp.swapaxes(V, -1, -2),
-            jg.internal_force_part(grasp, jnp.ones(V.shape[:-1], dtype)),
+            jg.contacts.internal_force_part(grasp, jnp.ones(V.shape[:-1], dtype)),
         )
 
     for a, b in zip(answers(grasp), jax.jit(jax.vmap(answers))(grasp), strict=True):
@@ -326,8 +336,8 @@ def test_float32_grasps_stay_float32_beside_x64():
     grasp = jg.Grasp(position, normal, jg.SoftFinger(0.4, 0.3))
     for answer in (
         jg.grasp_map(grasp),
-        jg.folded_grasp_map(grasp),
-        jg.grasp_singular_values(grasp),
+        jg.contacts.folded_grasp_map(grasp),
+        jg.contacts.grasp_singular_values(grasp),
         jg.null_space(grasp),
     ):
         assert answer.dtype == jnp.float32

@@ -182,7 +182,7 @@ def test_the_gap_is_a_proof_at_every_tolerance(dtype):
     loose = problem([1.0], -M, [np.eye(2)], [20.0], dtype)
     steps = []
     for goal in (1.0, 1e-1, 1e-2):
-        solution = lmi_minimize(loose, goal)
+        solution = lmi_minimize(loose, tolerance=goal)
         assert bool(solution.converged)
         assert float(solution.bound) <= optimum + 1e-6 <= float(solution.value) + 2e-6
         assert float(solution.gap) <= goal * max(1.0, abs(float(solution.value)))
@@ -207,7 +207,7 @@ def test_bad_starts_unbounded_problems_and_few_steps_are_reported(dtype):
     unbounded = lmi_minimize(problem([-1.0], np.eye(2), [np.eye(2)], [0.0], dtype))
     assert not bool(unbounded.converged)
     assert float(unbounded.gap) == np.inf
-    short = lmi_minimize(problem([1.0], -np.eye(2), [np.eye(2)], [20.0], dtype), 1e-8, 3)
+    short = lmi_minimize(problem([1.0], -np.eye(2), [np.eye(2)], [20.0], dtype), tolerance=1e-8, max_steps=3)
     assert int(short.iterations) == 3
     assert not bool(short.converged)
     assert 1.0 <= float(short.value) < 20.0

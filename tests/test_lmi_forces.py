@@ -34,7 +34,7 @@ def pinch(dtype, mu=0.5):
 )
 def test_the_pinch(criterion, cost, dtype):
     """W / (2 mu) = 10 N each; every force on the edge of its cone."""
-    out = jg.lmi_forces(pinch(dtype), LIFT.astype(dtype), criterion)
+    out = jg.lmi.lmi_forces(pinch(dtype), LIFT.astype(dtype), criterion=criterion)
     assert bool(out.feasible)
     np.testing.assert_allclose(out.cost, cost, rtol=2 * solved_to(dtype))
     assert float(out.bound) <= cost * (1 + solved_to(dtype))
@@ -44,7 +44,7 @@ def test_the_pinch(criterion, cost, dtype):
 def test_limits_bind_at_their_bound_and_forbid_beyond_it(dtype):
     limit = np.array([10.1, 9.9], dtype)
     grasps = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), pinch(dtype))
-    out = jg.lmi_forces(grasps, LIFT.astype(dtype), jg.SmallestSum(), max_normal=limit[:, None])
+    out = jg.lmi.lmi_forces(grasps, LIFT.astype(dtype), criterion=jg.SmallestSum(), max_normal=limit[:, None])
     np.testing.assert_array_equal(out.feasible, [True, False])
     np.testing.assert_allclose(out.cost[0], 20.0, rtol=2 * solved_to(dtype))
     assert float(out.cost[1]) == np.inf
@@ -76,8 +76,8 @@ def both_roads_agree(name, limits, criterion, count):
     """Random problems: costs to 1e-6 where both are optimal, no contradiction, the brackets overlap."""
     grasp, _, wrench, cap, limit = problems(name, limits, count, seed=77)
     make, parameter = CRITERIA[criterion]
-    one = jg.optimize_forces(grasp, wrench, make(parameter), cap, limit)
-    two = jg.lmi_forces(grasp, wrench, make(parameter), cap, limit)
+    one = jg.optimize_forces(grasp, wrench, criterion=make(parameter), max_normal=cap, torque_limits=limit)
+    two = jg.lmi.lmi_forces(grasp, wrench, criterion=make(parameter), max_normal=cap, torque_limits=limit)
     status, found = np.asarray(one.status), np.asarray(two.feasible)
     optimal, infeasible = status == Status.OPTIMAL, status == Status.INFEASIBLE
     both = optimal & found
@@ -98,7 +98,7 @@ def both_roads_agree(name, limits, criterion, count):
 
 def test_many_loads_for_one_grasp_and_lanes_that_are_no_problem(dtype):
     loads = np.array([LIFT, 2 * LIFT, np.full(6, np.nan)], dtype)
-    out = jg.lmi_forces(pinch(dtype), loads, jg.Gentlest())
+    out = jg.lmi.lmi_forces(pinch(dtype), loads, criterion=jg.Gentlest())
     np.testing.assert_allclose(np.asarray(out.cost)[:2], [10, 20], rtol=2 * solved_to(dtype))
     assert np.isnan(out.cost[2])
     assert not bool(out.feasible[2])
@@ -106,8 +106,10 @@ def test_many_loads_for_one_grasp_and_lanes_that_are_no_problem(dtype):
 
 def test_wrong_arguments_are_named():
     with pytest.raises(ValueError, match="criterion must be one such as"):
-        jg.lmi_forces(pinch("float32"), LIFT.astype("float32"), "gentlest")
+        jg.lmi.lmi_forces(pinch("float32"), LIFT.astype("float32"), criterion="gentlest")
     with pytest.raises(ValueError, match=r"wrench must have shape"):
-        jg.lmi_forces(pinch("float32"), np.ones(5, np.float32), jg.Gentlest())
+        jg.lmi.lmi_forces(pinch("float32"), np.ones(5, np.float32), criterion=jg.Gentlest())
     with pytest.raises(ValueError, match=r"max_normal must broadcast to shape \(2,\)"):
-        jg.lmi_forces(pinch("float32"), LIFT.astype("float32"), jg.Gentlest(), max_normal=np.ones(3))
+        jg.lmi.lmi_forces(
+            pinch("float32"), LIFT.astype("float32"), criterion=jg.Gentlest(), max_normal=np.ones(3)
+        )

@@ -13,12 +13,12 @@ def test_a_planar_pinch_lifts(norm, effort):
     position = np.array([[-1.0, 0.0], [1.0, 0.0]])
     grasp = jg.Grasp(position, -position, jg.HardFinger(0.4))
     loads = np.array([[0.0, -1.0, 0.0], [0.0, -3.0, 0.0], [0.0, 2.0, 0.0]])
-    out = jg.task_quality(grasp, loads, norm)
+    out = jg.task_quality(grasp, loads, norm=norm)
     np.testing.assert_allclose(out.effort, effort * np.array([1.0, 3.0, 2.0]) / 0.4, rtol=1e-6)
     assert int(out.worst) == 1
     assert float(out.multiple) == pytest.approx(0.4 / (3 * effort), rel=1e-6)
     with pytest.raises(ValueError, match="norm must be one of"):
-        jg.task_quality(grasp, loads, "L2")
+        jg.task_quality(grasp, loads, norm="L2")
 
 
 def test_what_cannot_be_held_has_no_multiple():
@@ -36,7 +36,9 @@ def test_isotropy_and_volume():
     G = np.asarray(jg.grasp_map(grasp)).copy()
     G[:, 3:] /= 0.05
     values = np.linalg.svd(G, compute_uv=False)
-    np.testing.assert_allclose(jg.grasp_isotropy(grasp, 0.05), values[:, -1] / values[:, 0], rtol=1e-9)
-    np.testing.assert_allclose(jg.grasp_volume(grasp, 0.05), values.prod(-1), rtol=1e-9)
+    np.testing.assert_allclose(
+        jg.quality.grasp_isotropy(grasp, torque_scale=0.05), values[:, -1] / values[:, 0], rtol=1e-9
+    )
+    np.testing.assert_allclose(jg.quality.grasp_volume(grasp, torque_scale=0.05), values.prod(-1), rtol=1e-9)
     two = jg.Grasp(position[:, :1], normal[:, :1], jg.HardFinger(0.5))
-    np.testing.assert_array_equal(jg.grasp_volume(two), np.zeros(5))
+    np.testing.assert_array_equal(jg.quality.grasp_volume(two), np.zeros(5))

@@ -40,7 +40,7 @@ def smallest_of_bank(grasp, norm, lessons):
 @pytest.mark.parametrize("norm", ["L1", pytest.param("Linf", marks=pytest.mark.slow)])
 def test_the_bank_finds_the_weakest_direction(grasps, norm):
     """h of any direction is at least epsilon; after a few lessons the bank's smallest is epsilon, nearly always."""
-    found = jg.epsilon_quality(grasps, norm, SCALE)
+    found = jg.epsilon_quality(grasps, norm=norm, torque_scale=SCALE)
     held = np.asarray(found.status) == jg.Status.RESISTANT
     assert held.sum() > 20
     value, _ = smallest_of_bank(grasps, norm, 4)
@@ -66,7 +66,7 @@ def test_a_shot_never_goes_uphill(grasps):
 
 def test_the_floor_is_below_epsilon_and_ranks_like_it(grasps):
     floor = np.asarray(EpsilonFloor(SCALE).value(grasps, ()))
-    found = jg.epsilon_quality(grasps, "L1", SCALE)
+    found = jg.epsilon_quality(grasps, norm="L1", torque_scale=SCALE)
     held = np.asarray(found.status) == jg.Status.RESISTANT
     assert (floor[held] <= np.asarray(found.upper)[held]).all()
     assert (floor[held] > 0).all()

@@ -50,7 +50,7 @@ def test_three_fingers_climb_to_the_equator_of_a_ball(placed):
 def test_every_grasp_returned_is_proved_and_within_what_was_asked(placed):
     out, _ = placed
     assert out.proved.all()
-    assert jg.check_certificate(out.grasp, out.verdict).all()
+    assert jg.check(out.grasp, out.verdict).all()
     distance = np.linalg.norm(out.position - np.array([0.1, 0.0, -0.2]), axis=-1)
     np.testing.assert_allclose(distance, 0.05, rtol=1e-9)
     pairs = [
@@ -145,7 +145,7 @@ def test_epsilon_as_the_objective_on_an_ellipsoid():
     [
         (lambda grasp: -jg.critical_friction(grasp).factor, True),
         (lambda grasp: jg.guaranteed_radius(grasp).radius, False),
-        (jg.grasp_isotropy, True),
+        (jg.quality.grasp_isotropy, True),
     ],
     ids=["critical friction", "guaranteed radius", "isotropy"],
 )

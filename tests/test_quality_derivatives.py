@@ -77,7 +77,7 @@ def epsilon(norm):
     """The upper bound, closely enough that it rarely jumps from one weak direction to another a percent weaker."""
 
     def measure(x):
-        q = jg.epsilon_quality(grasp_of(x), norm, torque_scale=1.0, tolerance=1e-3)
+        q = jg.epsilon_quality(grasp_of(x), norm=norm, torque_scale=1.0, tolerance=1e-3)
         return q.upper, q.smooth
 
     return measure
@@ -101,7 +101,7 @@ def sharp_critical(x):
     grasp = grasp_of(x)
     out = jg.critical_friction(grasp)
     below, above = (
-        jg.wrench_resistance(jg.with_friction_factor(grasp, end), tolerance=1e-12).margin
+        jg.wrench_resistance(jg.quality.with_friction_factor(grasp, end), tolerance=1e-12).margin
         for end in (out.lower, out.upper)
     )
     return out.lower - (out.upper - out.lower) * below / (above - below), critical(x)[1]
@@ -109,7 +109,7 @@ def sharp_critical(x):
 
 def task(norm):
     def measure(x):
-        out = jg.task_quality(grasp_of(x), x["load"], norm, tolerance=1e-12)
+        out = jg.task_quality(grasp_of(x), x["load"], norm=norm, tolerance=1e-12)
         return out.multiple, out.multiple > 0
 
     return measure
@@ -149,10 +149,10 @@ CASES = {
     "task Linf, planar": (task("Linf"), with_task(planar), CLOSED),
     "task L1, hard": (task("L1"), with_task(hard), CLOSED),
     "task Linf, soft": (task("Linf"), with_task(soft), CLOSED),
-    "isotropy, hard": (known(jg.grasp_isotropy), hard, CLOSED),
-    "isotropy, soft": (known(jg.grasp_isotropy), soft, CLOSED),
-    "volume, planar": (known(jg.grasp_volume), planar, CLOSED),
-    "volume, hard": (known(jg.grasp_volume), hard, CLOSED),
+    "isotropy, hard": (known(jg.quality.grasp_isotropy), hard, CLOSED),
+    "isotropy, soft": (known(jg.quality.grasp_isotropy), soft, CLOSED),
+    "volume, planar": (known(jg.quality.grasp_volume), planar, CLOSED),
+    "volume, hard": (known(jg.quality.grasp_volume), hard, CLOSED),
 }
 FAST = (
     "epsilon L1, planar",

@@ -9,7 +9,6 @@ from shapes import HARD, PLANAR, SOFT
 
 import jaxgrasp as jg
 from jaxgrasp import Status
-from jaxgrasp.conic.stop import Stop
 
 TIGHT = {"float64": 2e-8, "float32": 5e-3}
 F32 = pytest.mark.f32
@@ -141,7 +140,7 @@ def test_frictionless_pair(known):
 @F32
 def test_every_known_verdict_is_certified(known):
     grasp, res = known
-    assert jg.check_certificate(grasp, res).all()
+    assert jg.check(grasp, res).all()
 
 
 def test_internal_force_is_internal_and_scaled(known):
@@ -184,7 +183,7 @@ def test_two_planar_fingers_obey_nguyen(angle):
     )
     res = jg.wrench_resistance(grasp)
     assert list(res.status) == [Status.NOT_RESISTANT] * 3 + [Status.RESISTANT] * 3
-    assert jg.check_certificate(grasp, res).all()
+    assert jg.check(grasp, res).all()
     critical = jg.wrench_resistance(jg.Grasp(position, normal, jg.HardFinger(np.tan(a)), active))
     assert abs(float(critical.margin)) < 1e-8
     assert critical.status in (Status.MARGINAL, Status.NOT_RESISTANT, Status.RESISTANT)
@@ -201,7 +200,7 @@ def test_no_internal_force_with_a_normal_part_gives_minus_infinity():
     assert res.gap[0] == 0
     assert res.status[0] == Status.NOT_RESISTANT
     np.testing.assert_allclose(res.escape_twist[0], [0, 1, 0], atol=1e-12)
-    assert jg.check_certificate(grasp, res).all()
+    assert jg.check(grasp, res).all()
 
 
 BAD = {
@@ -272,11 +271,12 @@ def test_bad_numbers_make_their_own_lane_invalid_and_touch_no_other(batch):
     grasp = build(dirty)
     res = jg.wrench_resistance(grasp)
     assert (np.asarray(res.status)[lanes] == Status.INVALID).all()
-    for name in ("margin", "gap", "rank"):
+    for name in ("lower", "upper", "margin", "gap"):
         assert np.isnan(np.asarray(getattr(res, name))[lanes]).all(), name
+    np.testing.assert_array_equal(np.asarray(res.rank)[lanes], -1)
     others = np.setdiff1d(np.arange(len(res.status)), lanes)
     assert_same_bits(*(jax.tree.map(lambda x: np.asarray(x)[others], r) for r in (clean, res)))
-    assert jg.check_certificate(grasp, res).all()
+    assert jg.check(grasp, res).all()
 
 
 @F32
@@ -335,13 +335,14 @@ def test_verdict_only_agrees_and_stops_earlier(batch):
     assert decided.mean() > 0.97
     np.testing.assert_array_equal(np.asarray(full.status)[decided], np.asarray(quick.status)[decided])
     assert np.asarray(quick.iterations).sum() < 0.5 * np.asarray(full.iterations).sum()
-    assert jg.check_certificate(grasp, quick).all()
+    assert jg.check(grasp, quick).all()
 
 
 @F32
 def test_dtype_is_kept(batch, dtype):
     res = jg.wrench_resistance(build(batch))
-    for name in ("margin", "gap", "rank", "internal_force", "escape_twist"):
+    assert res.rank.dtype == res.status.dtype == jnp.int32
+    for name in ("lower", "upper", "margin", "gap", "internal_force", "escape_twist"):
         assert getattr(res, name).dtype == dtype
     assert res.status.dtype == res.iterations.dtype == res.stop.dtype == jnp.int32
 
@@ -362,24 +363,6 @@ def test_wrong_structure_raises_at_trace_time(batch):
         jg.wrench_resistance(grasp, tolerance=0.0)
     with pytest.raises(ValueError, match="planar soft finger"):
         jg.Grasp(np.zeros((2, 2)), np.ones((2, 2)), jg.SoftFinger())
-
-
-def test_status_numbers_and_sentences_are_fixed():
-    assert [s.value for s in Status] == [1, 2, 3, 4, 5, 6, 7, 8]
-    assert [Status(i).name for i in (6, 7, 8)] == ["OPTIMAL", "INFEASIBLE", "STALLED"]
-    assert all(s.sentence.endswith(".") for s in Status)
-    assert [s.value for s in Stop] == [0, 1, 2, 3, 4, 5]
-    assert all(s.sentence.endswith(".") for s in Stop)
-
-
-@pytest.mark.parametrize("enum", [Status, Stop])
-def test_members_are_found_by_entries_of_arrays_and_by_nothing_else(enum):
-    for member in enum:
-        for array in (np.array([member.value], np.int32), jnp.array([member.value], jnp.int32)):
-            assert enum(array[0]) is member
-    for wrong in (17, 1.5, "RESISTANT", None):
-        with pytest.raises(ValueError, match="not a valid"):
-            enum(wrong)
 
 
 @pytest.mark.parametrize(("k", "dimension"), [(PLANAR, 2), pytest.param(HARD, 3, marks=pytest.mark.slow)])

@@ -82,7 +82,7 @@ def test_every_verdict_in_the_file_is_proved_by_the_file(whole, dtype):
         internal_force=padded(table, "internal_force", 9),
         escape_twist=padded(table, "escape_twist", 6),
     )
-    assert jg.check_certificate(grasp, evidence).all()
+    assert jg.check(grasp, evidence).all()
     assert table["grasp_id"].to_pylist() == list(range(700))
     assert summary.rows == 700 and sum(summary.counts.values()) == 700
     assert summary.counts[Status.RESISTANT] == int((table["status"].to_numpy() == 1).sum()) > 30

@@ -43,7 +43,7 @@ def test_projection_onto_the_semidefinite_cone(dtype):
     start = np.einsum("iab,ab->i", E, np.eye(3)) / np.diagonal(curvature)
     constant = np.zeros((3, 3))
     values = arrays(dtype, cost, constant, E, start, curvature)
-    solution = jg.lmi_minimize(jg.LMIProblem(*values))
+    solution = jg.lmi.lmi_minimize(jg.lmi.LMIProblem(*values))
     values, vectors = np.linalg.eigh(M)
     clipped = np.maximum(values, 0)
     X = np.einsum("nab,nb,ncb->nac", vectors, clipped, vectors)
@@ -67,9 +67,9 @@ def test_a_log_det_cost_inverts_a_matrix(dtype):
         np.einsum("iab,ab->i", E, np.eye(q)) / np.array([1, 2, 2, 1, 2, 1]),
     )
     zero, w = np.zeros((q, q)), weight
-    term = jg.LogDetTerm(*arrays(dtype, w, zero, E))
+    term = jg.lmi.LogDetTerm(*arrays(dtype, w, zero, E))
     loose = arrays(dtype, cost, np.ones((1, 1)), np.zeros((len(E), 1, 1)), start)
-    solution = jg.lmi_minimize(jg.LMIProblem(*loose, log_det=term))
+    solution = jg.lmi.lmi_minimize(jg.lmi.LMIProblem(*loose, log_det=term))
     X = weight * np.linalg.inv(C)
     expected = weight * q - weight * np.linalg.slogdet(X)[1]
     assert bool(solution.converged)
@@ -80,10 +80,10 @@ def test_a_log_det_cost_inverts_a_matrix(dtype):
 
 
 def test_a_concave_cost_and_an_unheld_direction_are_refused(dtype):
-    concave = jg.LMIProblem(*arrays(dtype, [1.0], -np.eye(2), [np.eye(2)], [5.0], [[-1.0]]))
-    assert np.isnan(jg.lmi_minimize(concave).value)
-    free = jg.LMIProblem(*arrays(dtype, [1.0, 1.0], -np.eye(2), [np.eye(2), 0 * np.eye(2)], [5.0, 0.0]))
-    answer = jg.lmi_minimize(free)
+    concave = jg.lmi.LMIProblem(*arrays(dtype, [1.0], -np.eye(2), [np.eye(2)], [5.0], [[-1.0]]))
+    assert np.isnan(jg.lmi.lmi_minimize(concave).value)
+    free = jg.lmi.LMIProblem(*arrays(dtype, [1.0, 1.0], -np.eye(2), [np.eye(2), 0 * np.eye(2)], [5.0, 0.0]))
+    answer = jg.lmi.lmi_minimize(free)
     assert not bool(answer.converged)
     assert float(answer.gap) == np.inf
 
@@ -99,7 +99,7 @@ def test_three_answers_each_with_its_proof(dtype):
         [np.diag([-10.0, 11.0]), np.diag([-1.0, 1.0]), one, np.diag([-2.0, 1.0]), np.full((2, 2), np.nan)],
         np.array([e, e, x, e, e])[:, None],
     )
-    answer = jg.lmi_feasibility(constant, matrices)
+    answer = jg.lmi.lmi_feasibility(constant, matrices)
     np.testing.assert_array_equal(answer.feasible, [True, False, False, False, False])
     np.testing.assert_array_equal(answer.edge, [False, True, True, False, False])
     np.testing.assert_array_equal(answer.infeasible, [False, False, False, True, False])
@@ -118,7 +118,7 @@ def test_no_answer_depends_on_units(dtype):
         scale[:, None, None] * np.diag([-1.0, 1.1]),
         np.broadcast_to(np.diag([1.0, -1.0]), (3, 1, 2, 2)),
     )
-    answer = jg.lmi_feasibility(constant, matrices)
+    answer = jg.lmi.lmi_feasibility(constant, matrices)
     assert bool(answer.feasible.all())
     np.testing.assert_allclose(answer.depth, answer.depth[0], rtol=1e-3)
     np.testing.assert_allclose(np.asarray(answer.x)[:, 0] / scale, float(answer.x[0, 0]) * 1e3, rtol=1e-2)
@@ -161,7 +161,7 @@ def test_random_programs_agree_with_clarabel():
     constant[kind == 1] = symmetric(rng, (kind == 1).sum(), q)
     S[kind == 2, 0] = S[kind == 2, 1] @ S[kind == 2, 1]  # x_0 may grow without end, and that pays
     u[kind == 2, 0] = -1.0
-    out = jg.sdp_minimize(*arrays("float64", u, constant, S))
+    out = jg.lmi.sdp_minimize(*arrays("float64", u, constant, S))
     known = [clarabel_sdp(*one) for one in zip(u, constant, S, strict=True)]
     status = np.array([word for word, _ in known])
     best = np.array([value for _, value in known])
@@ -191,6 +191,6 @@ def test_random_programs_agree_with_clarabel():
 def test_wrong_shapes_are_named():
     u, constant, matrices = arrays("float32", [1.0, 1.0], np.eye(2), [np.eye(2)])
     with pytest.raises(ValueError, match=r"matrices must have shape \(\*batch, 2, 2, 2\), got \(1, 2, 2\)"):
-        jg.sdp_minimize(u, constant, matrices)
+        jg.lmi.sdp_minimize(u, constant, matrices)
     with pytest.raises(ValueError, match=r"curvature must have shape \(\*batch, 1, 1\), got \(2, 2\)"):
-        jg.lmi_minimize(jg.LMIProblem(u[:1], constant, matrices, u[:1], jnp.eye(2)))
+        jg.lmi.lmi_minimize(jg.lmi.LMIProblem(u[:1], constant, matrices, u[:1], jnp.eye(2)))

@@ -39,22 +39,29 @@ def scene():
     assert held.sum() > 500  # the rest are pushed by forces that do not balance
     force = -np.einsum("nij,nj->ni", np.linalg.pinv(G, rcond=1e-9), load)
     force += 0.2 * rng.normal(size=force.shape) * ~held[:, None]
-    return body, grasp, jnp.asarray(force), gravity, held, jg.mujoco_plant(body, H, gravity)
+    return (
+        body,
+        grasp,
+        jnp.asarray(force),
+        gravity,
+        held,
+        jg.motion.mujoco_plant(body, timestep=H, gravity=gravity),
+    )
 
 
 def test_accelerations_agree_in_any_state(scene):
     body, grasp, force, gravity, _, plant = scene
     state = random_states(np.random.default_rng(1), N, 3, speed=3.0)
-    wrench = jnp.einsum("nij,nj->ni", jg.world_grasp_map(grasp, state.orientation), force)
-    ours = jg.acceleration(body, state, wrench, gravity)
+    wrench = jnp.einsum("nij,nj->ni", jg.motion.world_grasp_map(grasp, state.orientation), force)
+    ours = jg.motion.acceleration(body, state, wrench, gravity)
     assert relative(plant.acceleration(state, wrench), ours).max() < 1e-9
 
 
 def test_one_step_is_semi_implicit_euler(scene):
     body, grasp, force, gravity, _, plant = scene
     state = random_states(np.random.default_rng(2), N, 3, speed=3.0)
-    wrench = jnp.einsum("nij,nj->ni", jg.world_grasp_map(grasp, state.orientation), force)
-    theirs, ours = plant.advance(state, wrench), jg.advance(body, state, wrench, H, gravity)
+    wrench = jnp.einsum("nij,nj->ni", jg.motion.world_grasp_map(grasp, state.orientation), force)
+    theirs, ours = plant.advance(state, wrench), jg.motion.advance(body, state, wrench, H, gravity)
     assert relative(tangent_difference(theirs, ours), np.zeros((N, 12))).max() < 1e-9
 
 
@@ -100,7 +107,7 @@ def test_mjx_alone_forgets_how_a_resting_body_starts_to_turn():
     """Why the plant integrates rotations below 1e-8 rad/s itself. Fails when MJX no longer needs that."""
     from jaxgrasp.motion.mujoco import _mjx
 
-    plant = jg.mujoco_plant(jg.RigidBody(1.0, np.eye(3)), H)
+    plant = jg.motion.mujoco_plant(jg.RigidBody(1.0, np.eye(3)), timestep=H)
 
     def turned_by(omega):
         data = plant.template.replace(qvel=jnp.concatenate([jnp.zeros(3), omega]))
@@ -117,12 +124,14 @@ def test_derivatives_hold_in_motion_too(scene):
     body, grasp, force, gravity, _, plant = scene
     few = jax.tree.map(lambda x: x[:20], (body, grasp, force))
     state = random_states(np.random.default_rng(3), 20, 3, speed=3.0)
-    plant = jg.mujoco_plant(few[0], H, gravity)
+    plant = jg.motion.mujoco_plant(few[0], timestep=H, gravity=gravity)
 
     def one(body, grasp, force, state):
         def motion(x, f):
             moved = tangent(state, x)
-            return jg.acceleration(body, moved, jg.world_grasp_map(grasp, moved.orientation) @ f, gravity)
+            return jg.motion.acceleration(
+                body, moved, jg.motion.world_grasp_map(grasp, moved.orientation) @ f, gravity
+            )
 
         return jax.jacfwd(motion, argnums=(0, 1))(jnp.zeros(12), force)
 
@@ -136,10 +145,10 @@ def test_derivatives_hold_in_motion_too(scene):
 def test_reverse_mode_gives_the_same(scene):
     body, grasp, force, gravity, _, _ = scene
     one = jax.tree.map(lambda x: x[0], (body, grasp, force))
-    plant, state = jg.mujoco_plant(one[0], H, gravity), jg.BodyState.at_rest()
+    plant, state = jg.motion.mujoco_plant(one[0], timestep=H, gravity=gravity), jg.BodyState.at_rest()
 
     def fallen(force):
-        wrench = jg.world_grasp_map(one[1], state.orientation) @ force
+        wrench = jg.motion.world_grasp_map(one[1], state.orientation) @ force
         return jnp.sum(plant.advance(state, wrench).velocity ** 2)
 
     direction = jnp.ones(12)
@@ -155,7 +164,7 @@ def c_engine(body, grasp, force, start, gravity):
     wrench = np.einsum("nij,tnj->tni", G, np.asarray(force))
     states = np.zeros((len(force), len(G), 13))
     for i in range(len(G)):
-        model = jg.mujoco_model(jax.tree.map(lambda x, i=i: x[i], body), H, gravity)
+        model = jg.motion.mujoco_model(jax.tree.map(lambda x, i=i: x[i], body), timestep=H, gravity=gravity)
         data = mujoco.MjData(model)
         data.qpos[:] = np.concatenate([start.position[i], start.orientation[i]])
         mujoco.mju_quat2Mat(R, data.qpos[3:])
@@ -179,11 +188,11 @@ def test_rollouts_are_those_of_the_c_engine(scene):
     start = random_states(rng, count, 3, speed=2.0)
     size = np.asarray(body.mass)[:, None]  # each step another force, of about a tenth of the weight
     force = held + jnp.asarray(size * rng.normal(size=(100, *held.shape)))
-    path = jg.mujoco_plant(body, H, gravity).roll_out(start, grasp, force)
+    path = jg.motion.mujoco_plant(body, timestep=H, gravity=gravity).roll_out(start, grasp, force)
 
     def step(now, f):
-        wrench = jnp.einsum("nij,nj->ni", jg.world_grasp_map(grasp, now.orientation), f)
-        after = jg.advance(body, now, wrench, H, gravity)
+        wrench = jnp.einsum("nij,nj->ni", jg.motion.world_grasp_map(grasp, now.orientation), f)
+        after = jg.motion.advance(body, now, wrench, H, gravity)
         return after, after
 
     ours = jax.lax.scan(step, start, force)[1]
@@ -202,7 +211,7 @@ def test_the_model_has_no_contacts_and_shows_the_mesh():
 
     box = trimesh.creation.box((0.04, 0.05, 0.06))
     body = jg.RigidBody.from_mesh(box, mass=0.3)
-    model = jg.mujoco_model(body, mesh=box)
+    model = jg.motion.mujoco_model(body, mesh=box)
     assert (model.ngeom, model.nv, model.body_mass[1]) == (1, 6, pytest.approx(0.3))
     assert model.geom_contype[0] == 0 and model.geom_conaffinity[0] == 0
     np.testing.assert_allclose(np.sort(model.body_inertia[1]), np.sort(np.diag(body.inertia)), rtol=1e-12)
@@ -214,19 +223,19 @@ def test_the_model_has_no_contacts_and_shows_the_mesh():
 def test_wrong_models_raise():
     body = jg.RigidBody(1.0, np.eye(3))
     with pytest.raises(ValueError, match="spatial bodies"):
-        jg.mujoco_plant(jg.RigidBody(1.0, 1.0))
+        jg.motion.mujoco_plant(jg.RigidBody(1.0, 1.0))
     with pytest.raises(ValueError, match="timestep must be"):
-        jg.mujoco_plant(body, timestep=-0.1)
+        jg.motion.mujoco_plant(body, timestep=-0.1)
     with pytest.raises(ValueError, match="holds one body"):
-        jg.mujoco_model(jg.RigidBody(np.ones(2), np.stack([np.eye(3)] * 2)))
+        jg.motion.mujoco_model(jg.RigidBody(np.ones(2), np.stack([np.eye(3)] * 2)))
     with pytest.raises(ValueError, match=r"body \[1\] is none"):
-        jg.mujoco_plant(jg.RigidBody(np.array([1.0, -1.0]), np.stack([np.eye(3)] * 2)))
+        jg.motion.mujoco_plant(jg.RigidBody(np.array([1.0, -1.0]), np.stack([np.eye(3)] * 2)))
 
 
 def test_nothing_is_printed_and_nothing_imported_before_it_is_needed():
     code = (
         "import sys, numpy as np, jaxgrasp as jg; assert 'mujoco' not in sys.modules; "
-        "jg.mujoco_plant(jg.RigidBody(1.0, np.eye(3))); assert 'mujoco' in sys.modules"
+        "jg.motion.mujoco_plant(jg.RigidBody(1.0, np.eye(3))); assert 'mujoco' in sys.modules"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("", "")

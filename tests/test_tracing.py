@@ -10,7 +10,7 @@ import pytest
 from grasps import random_coefficients, random_contacts
 
 import jaxgrasp as jg
-from jaxgrasp.conic.stop import Stop
+from jaxgrasp.core.status import Status
 
 K = 6
 
@@ -56,7 +56,7 @@ def test_the_bracket_shrinks_around_the_margin(traced, results, lane):
 
 def test_the_trace_tells_what_the_solver_did(traced, results, lane):
     assert len(traced.gap) == int(results.iterations[lane]) + 1
-    assert traced.stop == Stop.CONVERGED == int(results.stop[lane])
+    assert traced.stop == Status.CONVERGED == int(results.stop[lane])
     assert np.isnan([traced.residual[0], traced.centering[0], traced.length[0]]).all()
     assert (np.asarray(traced.residual[1:]) < 1e-9).all()
     for field in (traced.centering, traced.length):
@@ -72,14 +72,14 @@ def test_the_table_has_a_row_an_iteration_and_the_reason(traced):
     assert [int(line.split()[0]) for line in lines[1:-1]] == list(range(len(traced.gap)))
     last = lines[-2].split()
     assert float(last[1]) == pytest.approx(float(traced.lower[-1]), abs=1e-9)
-    assert lines[-1] == Stop.CONVERGED.sentence
+    assert lines[-1] == Status.CONVERGED.sentence
 
 
 def test_a_short_budget_and_a_loose_tolerance_are_obeyed(grasps, lane):
     short = jg.trace(grasps[lane], max_iterations=2)
     assert len(short.gap) == 3
-    assert short.stop == Stop.RUNNING
-    assert str(short).endswith(Stop.RUNNING.sentence)
+    assert short.stop == Status.RUNNING
+    assert str(short).endswith(Status.RUNNING.sentence)
     loose = jg.trace(grasps[lane], tolerance=1e-2)
     assert loose.gap[-1] <= 1e-2 < loose.gap[-2]
 
@@ -92,7 +92,7 @@ def test_a_batch_is_refused_with_advice(grasps):
 def test_a_lane_that_is_no_grasp_is_skipped(grasps):
     invalid = jg.Grasp(np.full((K, 3), np.nan), np.ones((K, 3)), jg.SoftFinger(0.5, 0.1))
     traced = jg.trace(invalid)
-    assert traced.stop == Stop.SKIPPED
+    assert traced.stop == Status.SKIPPED
     assert len(traced.gap) == 1
 
 
@@ -104,7 +104,7 @@ def bits(tree):
 def test_a_saved_lane_reproduces_its_verdict_bit_for_bit(tmp_path, grasps, results):
     for i in (0, 7, 19):
         path = tmp_path / f"lane{i}.npz"
-        jg.save_grasp(path, grasps[i])
+        jg.save_grasp(grasps[i], path)
         again = jg.load_grasp(path)
         assert again.position.dtype == grasps.position.dtype
         assert type(again.model) is jg.SoftFinger
@@ -116,7 +116,7 @@ def test_a_saved_lane_reproduces_its_verdict_bit_for_bit(tmp_path, grasps, resul
 def test_every_model_survives_the_file(tmp_path, model):
     rng = np.random.default_rng(0)
     grasp = jg.Grasp(rng.normal(size=(3, 3)), rng.normal(size=(3, 3)), model, np.array([True, True, False]))
-    jg.save_grasp(tmp_path / "lane.npz", grasp)
+    jg.save_grasp(grasp, tmp_path / "lane.npz")
     again = jg.load_grasp(tmp_path / "lane.npz")
     assert type(again.model) is type(model)
     assert bits(again) == bits(grasp)
@@ -126,21 +126,21 @@ def test_numbers_that_are_no_grasp_survive_too(tmp_path):
     """A bug report needs the NaN payload as it was."""
     position = np.array([[0.1, np.nan, np.inf], [1e-320, -0.0, 2.0]])
     grasp = jg.Grasp(position, -position, jg.HardFinger(np.array([-1.0, np.nan])))
-    jg.save_grasp(tmp_path / "lane.npz", grasp)
+    jg.save_grasp(grasp, tmp_path / "lane.npz")
     assert bits(jg.load_grasp(tmp_path / "lane.npz")) == bits(grasp)
 
 
 def test_the_file_is_replaced_whole_and_nothing_is_left_beside_it(tmp_path, grasps):
     path = tmp_path / "lane.npz"
-    jg.save_grasp(path, grasps[0])
-    jg.save_grasp(str(path), grasps[1])
+    jg.save_grasp(grasps[0], path)
+    jg.save_grasp(grasps[1], str(path))
     assert bits(jg.load_grasp(path)) == bits(grasps[1])
     assert [p.name for p in tmp_path.iterdir()] == ["lane.npz"]
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, grasps, monkeypatch):
     path = tmp_path / "lane.npz"
-    jg.save_grasp(path, grasps[0])
+    jg.save_grasp(grasps[0], path)
     before = path.read_bytes()
 
     def fail(*_, **__):
@@ -148,7 +148,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, grasps, monkeypatch):
 
     monkeypatch.setattr(np, "savez", fail)
     with pytest.raises(OSError, match="disk full"):
-        jg.save_grasp(path, grasps[1])
+        jg.save_grasp(grasps[1], path)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["lane.npz"]
 
@@ -160,7 +160,7 @@ def test_an_unknown_model_is_refused_before_anything_is_written(tmp_path, grasps
 
     grasp = jg.Grasp(grasps.position[0], grasps.normal[0], Sticky(0.3))
     with pytest.raises(ValueError, match="contact model Sticky; known models"):
-        jg.save_grasp(tmp_path / "lane.npz", grasp)
+        jg.save_grasp(grasp, tmp_path / "lane.npz")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -189,7 +189,7 @@ def fired():
 
 
 def spoiled(kind, path, grasps):
-    jg.save_grasp(path, grasps[0])
+    jg.save_grasp(grasps[0], path)
     content, arrays = path.read_bytes(), fields(path)
     if kind == "truncated":
         path.write_bytes(content[: len(content) // 2])

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["EPS", "RANK_TOLERANCE", "ROUNDING", "Rebuilt", "rebuild", "scaled_force"]
+__all__ = ["EPS", "RANK_TOLERANCE", "ROUNDING", "Rebuilt", "component_vectors", "rebuild", "scaled_force"]
 
 ROUNDING = 16.0  # c
 RANK_TOLERANCE = 64.0  # in units of eps of the grasp's dtype, relative to the largest singular value
@@ -111,3 +111,36 @@ def rebuild(grasp) -> Rebuilt:
     by_component = {"f_x": friction, "f_y": friction, "f_n": np.ones_like(friction), "tau_n": torsion}
     scale = np.stack([by_component[c] for c in components], -1)
     return Rebuilt(valid, live, length, friction, torsion, blocks, A, scale, components, normal_index)
+
+
+def component_vectors(grasp, orientation=None) -> np.ndarray:
+    """(*batch, k, r, n): each force component as a vector (force; torque of a soft finger), body or world axes."""
+    dimension = grasp.position.shape[-1]
+    names = [c.value for c in grasp.model.components(dimension)]
+    normal = np.asarray(grasp.normal, np.float64)
+    with np.errstate(all="ignore"):
+        normal = normal / np.max(np.abs(normal), -1, keepdims=True)
+        normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+        axes = [*_frame(normal), normal]
+    if orientation is not None:
+        turn = _rotation(np.asarray(orientation, np.float64))
+        axes = [np.einsum("...ij,...kj->...ki", turn, v) for v in axes]
+    column = {"f_x": axes[0], "f_y": axes[-2], "f_n": axes[-1], "tau_n": axes[-1]}
+    if "tau_n" not in names:
+        return np.stack([column[c] for c in names], -1)
+    zero = np.zeros_like(normal)
+    return np.stack(
+        [np.concatenate([zero, column[c]] if c == "tau_n" else [column[c], zero], -1) for c in names], -1
+    )
+
+
+def _rotation(orientation: np.ndarray) -> np.ndarray:
+    """R_WB of an angle (*batch, 1), or of a quaternion (w, x, y, z) of unit length."""
+    if orientation.shape[-1] == 1:
+        c, s = np.cos(orientation[..., 0]), np.sin(orientation[..., 0])
+        return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+    w, v = orientation[..., :1, None], orientation[..., 1:]
+    cross = np.cross(np.eye(3), v[..., None, :])  # v x e_i as columns, transposed below
+    outer = v[..., :, None] * v[..., None, :]
+    square = np.sum(v * v, -1)[..., None, None]
+    return (w * w - square) * np.eye(3) + 2 * outer - 2 * w * np.swapaxes(cross, -1, -2)

@@ -104,19 +104,29 @@ def check(
     console.print(f"written to {run.output}", highlight=False, soft_wrap=True, markup=False)
 
 
-def _counts(columns: dict[str, np.ndarray], title: str) -> Table:
-    from ..motion import ControllabilityVerdict
+# The answers of a check, best first.
+CHECKED = (
+    Status.RESISTANT,
+    Status.CONTROLLABLE,
+    Status.MARGINAL,
+    Status.NOT_CONTROLLABLE,
+    Status.NO_EQUILIBRIUM,
+    Status.UNDECIDED,
+    Status.INVALID,
+)
 
+
+def _counts(columns: dict[str, np.ndarray], title: str) -> Table:
     table = Table(title=title)
     table.add_column("controllability")
     for head in ("grasps", "share", "recovered"):
         table.add_column(head, justify="right")
     total = len(columns["verdict"])
-    for verdict in ControllabilityVerdict:
+    for verdict in CHECKED:
         here = columns["verdict"] == verdict.value
         if here.any():
             back = int(columns["recovered"][here].sum())
-            known = verdict in (ControllabilityVerdict.RESISTANT, ControllabilityVerdict.CONTROLLABLE)
+            known = verdict in (Status.RESISTANT, Status.CONTROLLABLE)
             words = verdict.name.replace("_", " ").lower()
             table.add_row(
                 words, f"{here.sum():,}", f"{100 * here.sum() / total:.2f} %", f"{back:,}" if known else ""

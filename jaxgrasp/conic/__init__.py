@@ -24,7 +24,6 @@ from .linear import (
 from .reduced_newton import Motion, newton_solve
 from .regularity import regular
 from .singular_values import row_svd
-from .stop import Stop
 
 __all__ = [
     "Bounds",
@@ -40,7 +39,6 @@ __all__ = [
     "Shift",
     "State",
     "Step",
-    "Stop",
     "Vector",
     "advance",
     "as_vector",

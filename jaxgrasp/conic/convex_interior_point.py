@@ -16,11 +16,10 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..backend import stage
-from ..core import Array
+from ..core import Array, Status
 from .cone import cone_max, cone_min, cone_sum, inner, interior_distance
 from .convex_newton import measure, newton_step
 from .convex_program import ConvexProgram, Point
-from .stop import Stop
 
 __all__ = ["Answered", "State", "begin_convex_program", "solve_convex_program"]
 
@@ -118,20 +117,20 @@ def _judged(
     largest: Array, fine: float,
 ) -> State:  # fmt: skip
     """Take the step in the lanes where it is sound; say why the others stop."""
-    running = state.stop == Stop.RUNNING.value
+    running = state.stop == Status.RUNNING.value
     slow = (excess > STALL_RATIO * state.excess) & (infeasibility > STALL_RATIO * state.infeasibility)
     slow = slow & (infeasibility < ALMOST) & running
     stalled = jnp.where(slow, state.stalled + 1, jnp.zeros_like(state.stalled))
     met = infeasibility <= jnp.maximum(0.1 * primal, fine * (1 + largest))
     sound = (primal > 0) & (dual > 0)
 
-    def code(stop: Stop, where: Array, otherwise: Array) -> Array:
+    def code(stop: Status, where: Array, otherwise: Array) -> Array:
         return jnp.where(where, jnp.int32(stop.value), otherwise)
 
-    stop = code(Stop.STALLED, stalled >= PATIENCE, jnp.zeros_like(state.stop))
-    stop = code(Stop.BREAKDOWN, ~sound, stop)
-    stop = code(Stop.DECIDED, (proven | by_step) & ~was_close, stop)
-    stop = code(Stop.CONVERGED, sound & close & met & centred, stop)
+    stop = code(Status.STALLED, stalled >= PATIENCE, jnp.zeros_like(state.stop))
+    stop = code(Status.BREAKDOWN, ~sound, stop)
+    stop = code(Status.DECIDED, (proven | by_step) & ~was_close, stop)
+    stop = code(Status.CONVERGED, sound & close & met & centred, stop)
     ray = jnp.where(running & by_step, change, jnp.where(running, rows, state.ray))
     iterations = jnp.where(running, state.iterations + 1, state.iterations)
     stop = jnp.where(running, stop, state.stop)
@@ -159,7 +158,7 @@ def advance(program: ConvexProgram, state: State, tolerance: Array, proves: Answ
 
 @stage
 def _running_and(stop: Array, primal: Array, dual: Array) -> Array:
-    return (stop == Stop.RUNNING.value) & (primal > 0) & (dual > 0)
+    return (stop == Status.RUNNING.value) & (primal > 0) & (dual > 0)
 
 
 @stage
@@ -171,7 +170,7 @@ def begin_convex_program(program: ConvexProgram, point: Point, skip: Array) -> S
     """The state before the first step; lanes in ``skip`` never run."""
     excess, _ = measure(program, point.u, point.z, point.slack, point.price)
     zero = jnp.zeros(excess.shape, jnp.int32)
-    code = jnp.where(skip, jnp.int32(Stop.SKIPPED.value), jnp.int32(Stop.RUNNING.value))
+    code = jnp.where(skip, jnp.int32(Status.SKIPPED.value), jnp.int32(Status.RUNNING.value))
     infeasibility, centred = _infeasibility(program, point), jnp.zeros_like(skip)
     return State(point, excess, infeasibility, centred, _rows(point), zero, zero, code)
 
@@ -188,7 +187,7 @@ def solve_convex_program(
 
     def unfinished(carry: tuple[Array, State]) -> Array:
         count, state = carry
-        return (count < budget) & jnp.any(state.stop == Stop.RUNNING.value)
+        return (count < budget) & jnp.any(state.stop == Status.RUNNING.value)
 
     def body(carry: tuple[Array, State]) -> tuple[Array, State]:
         count, state = carry

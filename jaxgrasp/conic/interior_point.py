@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..backend import stage
-from ..core import Array, pivot_tolerance
+from ..core import Array, Status, pivot_tolerance
 from .cone import (
     Cone,
     Scaling,
@@ -37,7 +37,6 @@ from .cone import (
 from .cone_program import ConeProgram
 from .linear import Vector, cholesky, cholesky_solve, gram, matvec, rmatvec
 from .scaling import nesterov_todd
-from .stop import Stop
 
 __all__ = [
     "Iterate",
@@ -77,7 +76,7 @@ class Progress(NamedTuple):
     gap: Array  # <u, z>
     iterations: Array
     stalled: Array  # consecutive slow steps
-    stop: Array  # Stop, int32
+    stop: Array  # Status, int32
 
 
 @stage
@@ -229,7 +228,7 @@ def _accept(
     decided: Decision | None,
 ) -> Progress:
     """Take the step in the lanes it improves; say why the others stop."""
-    running = state.stop == Stop.RUNNING.value
+    running = state.stop == Status.RUNNING.value
     taken = running & inside & (gap < state.gap)
 
     def select(new: Array, old: Array) -> Array:
@@ -239,15 +238,15 @@ def _accept(
     slow = gap > STALL_RATIO * state.gap
     stalled = jnp.where(taken & slow, state.stalled + 1, jnp.zeros_like(state.stalled))
 
-    def code(stop: Stop, where: Array, otherwise: Array) -> Array:
+    def code(stop: Status, where: Array, otherwise: Array) -> Array:
         return jnp.where(where, jnp.int32(stop.value), otherwise)
 
-    stop = code(Stop.STALLED, ~taken | (stalled >= PATIENCE), jnp.zeros_like(state.stop))
-    stop = code(Stop.BREAKDOWN, ~inside, stop)
+    stop = code(Status.STALLED, ~taken | (stalled >= PATIENCE), jnp.zeros_like(state.stop))
+    stop = code(Status.BREAKDOWN, ~inside, stop)
     if decided is not None:
-        stop = code(Stop.DECIDED, taken & decided(program, iterate), stop)
+        stop = code(Status.DECIDED, taken & decided(program, iterate), stop)
     goal = tolerance * jnp.maximum(jnp.ones_like(gap), jnp.abs(program.dual_value(iterate.y)))
-    stop = code(Stop.CONVERGED, taken & (gap <= goal), stop)
+    stop = code(Status.CONVERGED, taken & (gap <= goal), stop)
     return Progress(
         iterate,
         select(gap, state.gap),
@@ -261,7 +260,7 @@ def begin_cone_program(program: ConeProgram, point: Iterate, skip: Array) -> Pro
     """The state before the first step; lanes in ``skip`` never run."""
     gap, _ = _gap(program.exists, point)
     zero = jnp.zeros(gap.shape, jnp.int32)
-    code = jnp.where(skip, jnp.int32(Stop.SKIPPED.value), jnp.int32(Stop.RUNNING.value))
+    code = jnp.where(skip, jnp.int32(Status.SKIPPED.value), jnp.int32(Status.RUNNING.value))
     return Progress(point, gap, zero, zero, code)
 
 
@@ -280,7 +279,7 @@ def solve_cone_program(
 
     def unfinished(carry: tuple[Array, Progress]) -> Array:
         count, progress = carry
-        return (count < budget) & jnp.any(progress.stop == Stop.RUNNING.value)
+        return (count < budget) & jnp.any(progress.stop == Status.RUNNING.value)
 
     def body(carry: tuple[Array, Progress]) -> tuple[Array, Progress]:
         count, progress = carry

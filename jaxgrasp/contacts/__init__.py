@@ -1,6 +1,7 @@
 """Section 11.1: contact models, grasps, the grasp map G, and the folded map A that carries mu and gamma."""
 
 from .folded import Contacts, Folded, contacts_of, fold, unfold
+from .frames import Axes, TorqueLimits, component_vectors, contact_frames, force_vectors
 from .friction_cones import cone_use, into_cones, nearest_admissible
 from .grasp import Grasp
 from .grasp_map import (
@@ -26,6 +27,11 @@ from .projection import (
 from .tiled_derivatives import kept, masked, safe_contacts, tiled, tiled_solver, zero_tangent
 
 __all__ = [
+    "Axes",
+    "TorqueLimits",
+    "component_vectors",
+    "contact_frames",
+    "force_vectors",
     "Component",
     "ContactModel",
     "Contacts",

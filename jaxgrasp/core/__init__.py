@@ -1,5 +1,6 @@
 """Ground floor: array vocabulary, tolerances by dtype, statuses, rigid-body geometry, errors. It knows no grasp."""
 
+from .answer import Answer
 from .arrays import Array, Bool, Float, Int, real_array
 from .errors import UserError
 from .geometry import (
@@ -14,6 +15,7 @@ from .geometry import (
     skew,
     wrench_dimension,
 )
+from .renamed import renamed
 from .rotations import (
     identity_orientation,
     jacobian_product,
@@ -24,7 +26,7 @@ from .rotations import (
     rotation_between,
     turned,
 )
-from .status import SpokenEnum, Status
+from .status import Status
 from .tolerances import (
     balance_tolerance,
     complementary_ratio,
@@ -43,11 +45,11 @@ from .tolerances import (
 from .version import __version__
 
 __all__ = [
+    "Answer",
     "Array",
     "Bool",
     "Float",
     "Int",
-    "SpokenEnum",
     "Status",
     "UserError",
     "__version__",
@@ -71,6 +73,7 @@ __all__ = [
     "proven_limit",
     "rank_tolerance",
     "real_array",
+    "renamed",
     "rotate",
     "rotate_wrench",
     "rotation_between",

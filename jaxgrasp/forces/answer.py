@@ -14,7 +14,6 @@ from ..conic import (
     Cone,
     ConvexProgram,
     Point,
-    Stop,
     Vector,
     as_vector,
     cone_max,
@@ -82,11 +81,11 @@ def _statuses(
     met = short <= fine
     tight = (cost - bound) <= tolerance * jnp.maximum(scale, jnp.abs(cost))
     if smoothing is not None:  # the answer is a point of the central path, at a gap of its own
-        tight = stop == Stop.CONVERGED.value
+        tight = stop == Status.CONVERGED.value
     finite = jnp.isfinite(cost) & jnp.isfinite(bound)
     status = jnp.full(cost.shape, Status.STALLED.value, jnp.int32)
     status = choose(Status.INFEASIBLE, proof > 0, status)
-    status = choose(Status.OPTIMAL, met & tight & finite & (stop != Stop.SKIPPED.value), status)
+    status = choose(Status.OPTIMAL, met & tight & finite & (stop != Status.SKIPPED.value), status)
     status = choose(Status.OPTIMAL, rest, status)
     status = choose(Status.STALLED, off, status)
     status = choose(Status.INFEASIBLE, off & (off_proof > 0), status)

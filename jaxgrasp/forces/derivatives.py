@@ -22,7 +22,7 @@ import numpy as np
 from jax import lax
 
 from ..backend import inlined, to_lanes, to_rows
-from ..conic import Cholesky, Cone, ConvexProgram, Point, Stop, cone_sum, lagrangian, point_tangent, residuals
+from ..conic import Cholesky, Cone, ConvexProgram, Point, cone_sum, lagrangian, point_tangent, residuals
 from ..contacts import (
     Component,
     Contacts,
@@ -196,7 +196,7 @@ def _tangents(form: _Form, result: Solved, rows: Rows, change: Rows) -> Solved:
     assert result.point is not None and result.scales is not None
     status, stop = flat(result.answer.status), flat(result.stop)
     point, scales = jax.tree.map(lambda x: to_lanes(flat(x)), (result.point, result.scales))
-    ok = (status == Status.OPTIMAL.value) & (stop != Stop.SKIPPED.value)
+    ok = (status == Status.OPTIMAL.value) & (stop != Status.SKIPPED.value)
 
     data = _safe(ok, data)
     changes = jax.tree.map(lambda x, dx: masked(ok, x, dx), data, changes)

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 from jax.core import Tracer
+from jax.typing import ArrayLike
 
-from ..contacts import Grasp, folded_grasp_map, length_scale
-from ..core import Array, Bool, Float, Int, SpokenEnum, Status, rank_tolerance
+from ..contacts import Grasp, TorqueLimits, folded_grasp_map, length_scale
+from ..core import Answer, Array, Bool, Float, Int, Status, rank_tolerance
 from ..resistance import wrench_resistance
 from .criteria import Criterion, Gentlest, Robust, SmallestSum
-from .solve import ForceOptimum, optimize_forces, spread_loads
+from .demand import spread_loads
+from .solve import OptimalForces, optimize_forces
 
 __all__ = [
     "Equilibrium",
-    "EquilibriumKind",
     "ResistibleWrenches",
     "Squeeze",
     "equilibrium",
@@ -25,32 +26,27 @@ __all__ = [
 ]
 
 
-class EquilibriumKind(SpokenEnum):
-    """The three answers of Definition 2, and the two that admit there is none."""
+class Equilibrium(Answer):
+    """The kind of equilibrium of each grasp under its load (Definition 2), and the evidence.
 
-    NONE = 1, "No equilibrium: no admissible forces balance the load; the escape twist proves it."
-    MARGINAL = (
-        2,
-        "Marginal equilibrium: forces balance the load, but some contact is at the edge of its friction cone.",
-    )
-    NON_MARGINAL = 3, "Non-marginal equilibrium: forces strictly inside every friction cone balance the load."
-    UNDECIDED = 4, "Undecided: the solver stopped before it had a proof either way."
-    INVALID = 5, "Invalid: the numbers are not a grasp with a load."
-
-
-class Equilibrium(eqx.Module):
-    """The kind of equilibrium of each grasp under its load, and the evidence.
-
-    kind          int32, an ``EquilibriumKind``
-    force         (*batch, k n) N: balances the load inside the cones (on their edge where MARGINAL); zero where NONE
-    slack         (*batch) N: ``min_i f_n,i - psi_i(f_i)`` of ``force``; minus infinity where NONE
-    escape_twist  (*batch, m): the proof of NONE; else zero
+    status        int32, a ``Status``: NON_MARGINAL, MARGINAL, NO_EQUILIBRIUM, UNDECIDED or INVALID
+    force         (*batch, k n) N: balances the load inside the cones (on their edge where MARGINAL); zero where there
+                  is NO_EQUILIBRIUM
+    slack         (*batch) N: ``min_i f_n,i - psi_i(f_i)`` of ``force``; minus infinity where NO_EQUILIBRIUM
+    escape_twist  (*batch, m): the proof of NO_EQUILIBRIUM; else zero
     """
 
-    kind: Int[Array, "*batch"]
+    status: Int[Array, "*batch"]
     force: Float[Array, "*batch kn"]
     slack: Float[Array, "*batch"]
     escape_twist: Float[Array, "*batch m"]
+
+    SENTENCES: ClassVar[Mapping[Status, str]] = {
+        Status.MARGINAL: "Marginal equilibrium: forces balance the load, but some contact is at the edge of its "
+        "friction cone.",
+        Status.NO_EQUILIBRIUM: "No equilibrium: no admissible forces balance the load; the escape twist proves it.",
+        Status.INVALID: "Invalid: the numbers are not a grasp with a load.",
+    }
 
 
 def _slack(grasp: Grasp, force: Array) -> Array:
@@ -73,35 +69,37 @@ def _with_load_axes(grasp: Grasp, loads: int) -> Grasp:
     return Grasp(widen(grasp.position), widen(grasp.normal), model, widen(grasp.active))
 
 
-def equilibrium(grasp: Grasp, wrench: Float[Array, "*batch m"], tolerance: float = 1e-8) -> Equilibrium:
+def equilibrium(
+    grasp: Grasp, wrench: Float[ArrayLike, "*batch m"], *, tolerance: float = 1e-8
+) -> Equilibrium:
     """None, marginal or non-marginal (Definition 2): ``G f + wrench = 0`` with f in, or strictly inside, the cones.
 
     ``wrench`` as for ``optimize_forces``; zero asks for equilibria without a load, of which f = 0 is a marginal one.
-    NON_MARGINAL is proven by its force, the robust optimum, which exists iff some force is strictly inside; NONE by an
-    escape twist. MARGINAL means that forces exist and the search for one strictly inside failed.
+    NON_MARGINAL is proven by its force, the robust optimum, which exists iff some force is strictly inside;
+    NO_EQUILIBRIUM by an escape twist. MARGINAL means that forces exist and the search for one strictly inside failed.
     """
-    robust = optimize_forces(grasp, wrench, Robust(_weights(grasp, wrench)), tolerance=tolerance)
+    robust = optimize_forces(grasp, wrench, criterion=Robust(_weights(grasp, wrench)), tolerance=tolerance)
     inside = (robust.status == Status.OPTIMAL.value) & (_slack(grasp, robust.force) > 0)
     decided = inside | (robust.status == Status.INFEASIBLE.value) | (robust.status == Status.INVALID.value)
     edge = robust
     if isinstance(decided, Tracer) or not bool(jnp.all(decided)):
-        edge = optimize_forces(grasp, wrench, SmallestSum(), tolerance=tolerance)
-    kind = jnp.full(robust.status.shape, EquilibriumKind.UNDECIDED.value, jnp.int32)
+        edge = optimize_forces(grasp, wrench, criterion=SmallestSum(), tolerance=tolerance)
+    status = jnp.full(robust.status.shape, Status.UNDECIDED.value, jnp.int32)
 
-    def choose(value: EquilibriumKind, where: Array, otherwise: Array) -> Array:
+    def choose(value: Status, where: Array, otherwise: Array) -> Array:
         return jnp.where(where, jnp.int32(value.value), otherwise)
 
-    kind = choose(EquilibriumKind.MARGINAL, edge.status == Status.OPTIMAL.value, kind)
+    status = choose(Status.MARGINAL, edge.status == Status.OPTIMAL.value, status)
     none = (robust.status == Status.INFEASIBLE.value) | (edge.status == Status.INFEASIBLE.value)
-    kind = choose(EquilibriumKind.NONE, none, kind)
-    kind = choose(EquilibriumKind.NON_MARGINAL, inside, kind)
-    kind = choose(EquilibriumKind.INVALID, robust.status == Status.INVALID.value, kind)
+    status = choose(Status.NO_EQUILIBRIUM, none, status)
+    status = choose(Status.NON_MARGINAL, inside, status)
+    status = choose(Status.INVALID, robust.status == Status.INVALID.value, status)
     force = jnp.where(inside[..., None], robust.force, edge.force)
-    slack = jnp.where(kind == EquilibriumKind.NONE.value, -jnp.inf, _slack(grasp, force))
+    slack = jnp.where(status == Status.NO_EQUILIBRIUM.value, -jnp.inf, _slack(grasp, force))
     escape = jnp.where(
         (robust.status == Status.INFEASIBLE.value)[..., None], robust.escape_twist, edge.escape_twist
     )
-    return Equilibrium(kind, force, slack, escape)
+    return Equilibrium(status, force, slack, escape)
 
 
 def _weights(grasp: Grasp, wrench: Any) -> Array:
@@ -114,22 +112,30 @@ def _weights(grasp: Grasp, wrench: Any) -> Array:
     return jnp.where(size > 0, size, jnp.ones_like(size))
 
 
-class Squeeze(eqx.Module):
+class Squeeze(Answer):
     """``f_p + s f_int`` (11.2): the least squeeze that brings a particular solution into the friction cones.
 
+    status            int32, a ``Status``: OPTIMAL, INFEASIBLE where no squeeze helps, INVALID
     effort            (*batch) s_min, the mean normal force of the squeeze in N; infinite where squeezing cannot help
     force             (*batch, k n) N: ``particular + effort * internal``; zero where effort is infinite
     particular        (*batch, k n) N: f_p, balances the load, may pull or slide
     internal          (*batch, k n): f_int, mean normal force 1, strictly inside the cones, no net wrench
     """
 
+    status: Int[Array, "*batch"]
     effort: Float[Array, "*batch"]
     force: Float[Array, "*batch kn"]
     particular: Float[Array, "*batch kn"]
     internal: Float[Array, "*batch kn"]
 
+    SENTENCES: ClassVar[Mapping[Status, str]] = {
+        Status.OPTIMAL: "Held: squeezing along the internal force brings every contact into its friction cone.",
+        Status.INFEASIBLE: "Not held: no squeeze along the internal force brings every contact into its friction cone.",
+        Status.INVALID: "Invalid: the numbers are not a grasp with a load.",
+    }
 
-def squeeze(grasp: Grasp, wrench: Float[Array, "*batch m"]) -> Squeeze:
+
+def squeeze(grasp: Grasp, wrench: Float[ArrayLike, "*batch m"]) -> Squeeze:
     """``s_min = min s >= 0  subject to  f_p + s f_int in C``: (11.2), Figure 11.1, Prop. 11.5.1.
 
     f_int is the internal force of the margin (``wrench_resistance``), f_p the solution of ``G f + wrench = 0`` of least
@@ -174,45 +180,62 @@ def squeeze(grasp: Grasp, wrench: Float[Array, "*batch m"]) -> Squeeze:
     flat = jnp.broadcast_to(internal, p.shape).reshape(*shape, k * n)
     finite = usable[..., None]
     force = jnp.where(finite, particular + jnp.where(usable, effort, 0.0)[..., None] * flat, 0.0)
-    return Squeeze(effort, force, particular, flat)
+    sound = jnp.expand_dims(verdict.status != Status.INVALID.value, axes) & jnp.all(
+        jnp.isfinite(loads), axis=-1
+    )
+    held = jnp.where(usable, jnp.int32(Status.OPTIMAL.value), jnp.int32(Status.INFEASIBLE.value))
+    status = jnp.where(sound, held, jnp.int32(Status.INVALID.value))
+    return Squeeze(status, effort, force, particular, flat)
 
 
-class ResistibleWrenches(eqx.Module):
+class ResistibleWrenches(Answer):
     """Which of a set of T wrenches each grasp can hold, and with how little force.
 
-    held     (*batch, T) bool: OPTIMAL forces were found        optimum  the ``ForceOptimum`` of every wrench
-    share    (*batch) of the wrenches that are held             cost     (*batch, T); infinite where not held
-    worst    (*batch) int32: the wrench that costs most, or one that cannot be held
+    status   (*batch, T) int32, a ``Status``: OPTIMAL where the wrench can be held
+    forces   the ``OptimalForces`` of every wrench, with their proofs
     """
 
-    held: Bool[Array, "*batch T"]
-    optimum: ForceOptimum
+    status: Int[Array, "*batch T"]
+    forces: OptimalForces
+
+    SENTENCES: ClassVar[Mapping[Status, str]] = OptimalForces.SENTENCES
+
+    @property
+    def held(self) -> Bool[Array, "*batch T"]:
+        """Whether optimal forces for this wrench were found."""
+        return self.status == Status.OPTIMAL.value
 
     @property
     def cost(self) -> Float[Array, "*batch T"]:
-        return jnp.where(self.held, self.optimum.cost, jnp.inf)
+        """The criterion at the optimal forces; infinite where the wrench is not held."""
+        return jnp.where(self.held, self.forces.cost, jnp.inf)
 
     @property
     def share(self) -> Float[Array, "*batch"]:
-        return jnp.mean(self.held.astype(self.optimum.cost.dtype), axis=-1)
+        """The part of the T wrenches that are held, 0 to 1."""
+        return jnp.mean(self.held.astype(self.forces.cost.dtype), axis=-1)
 
     @property
     def worst(self) -> Int[Array, "*batch"]:
+        """The wrench that costs most, or one that cannot be held."""
         return jnp.argmax(self.cost, axis=-1).astype(jnp.int32)
 
 
 def resistible_wrenches(
     grasp: Grasp,
-    wrenches: Float[Array, "*batch T m"],
+    wrenches: Float[ArrayLike, "*batch T m"],
+    *,
     criterion: Criterion | None = None,
-    max_normal: Any = None,
-    torque_limits: tuple[Any, Any] | None = None,
+    max_normal: Float[ArrayLike, "*batch k"] | None = None,
+    torque_limits: TorqueLimits
+    | tuple[Float[ArrayLike, "*batch kn q"], Float[ArrayLike, "*batch q"]]
+    | None = None,
     tolerance: float = 1e-8,
 ) -> ResistibleWrenches:
     """Which task wrenches can be held, and with how little force: ``min h(f)`` subject to ``G f + w_j = 0``, f in C.
 
     ``wrenches`` (T, m) go to every grasp, (*batch, T, m) to their own. Criterion (``Gentlest()`` by default), limits
-    and tolerance as for ``optimize_forces``; every answer carries its proof in ``.optimum``.
+    and tolerance as for ``optimize_forces``; every answer carries its proof in ``.forces``.
     """
     array = jnp.asarray(wrenches)
     if array.ndim < 2:
@@ -220,5 +243,12 @@ def resistible_wrenches(
     if array.ndim == 2:
         array = jnp.broadcast_to(array, (*grasp.batch_shape, *array.shape))
     criterion = Gentlest() if criterion is None else criterion
-    optimum = optimize_forces(grasp, array, criterion, max_normal, torque_limits, tolerance)
-    return ResistibleWrenches(optimum.status == Status.OPTIMAL.value, optimum)
+    forces = optimize_forces(
+        grasp,
+        array,
+        criterion=criterion,
+        max_normal=max_normal,
+        torque_limits=torque_limits,
+        tolerance=tolerance,
+    )
+    return ResistibleWrenches(forces.status, forces)

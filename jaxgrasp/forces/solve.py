@@ -8,69 +8,94 @@ optimum or to a proof that there is none (``solver.primal_dual``); read the answ
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
+from jax.typing import ArrayLike
 
 from ..backend import batched, in_chunks, in_sweeps, kernel, tile_width, to_lanes, to_rows
-from ..conic import State, Stop, as_vector, begin_convex_program, regular, solve_convex_program
-from ..contacts import Component, Contacts, Folded, Grasp, Projection, contacts_of, fold, project, to_twist
-from ..core import Array, Bool, Float, Int, Status, gap_floor, real_array, unit_roundoff, wrench_dimension
-from .answer import Answer, answer
+from ..certificates import check_forces, checked_by, force_claim
+from ..conic import State, as_vector, begin_convex_program, regular, solve_convex_program
+from ..contacts import Component, Folded, Grasp, Projection, TorqueLimits, fold, project, to_twist
+from ..core import Answer, Array, Bool, Float, Int, Status, gap_floor, unit_roundoff, wrench_dimension
+from .answer import Answer as LaneAnswer
+from .answer import answer
 from .criteria import Criterion, Gentlest
+from .demand import demand_rows, spread_loads
 from .derivatives import Rows, Scales, Solved, differentiable
-from .problem import Balance, Demand, balance, proves, starting_point
+from .problem import Balance, balance, proves, starting_point
 
-__all__ = ["ForceOptimum", "optimize_forces"]
+__all__ = ["OptimalForces", "optimize_forces"]
 
 FIRST_BUDGET = 12  # iterations before stragglers are gathered
 TOTAL_BUDGET = 60
 CHUNK = 4096  # problems an executable takes at once when called on concrete arrays
 
 
-class ForceOptimum(eqx.Module):
+def _check(grasp: Grasp, answer: OptimalForces, problem: Any, tolerance: float | None) -> np.ndarray:
+    return check_forces(grasp, force_claim(grasp, answer, problem), tolerance)
+
+
+@checked_by(_check)
+class OptimalForces(Answer):
     """Optimal contact forces and their proofs, with the batch axes in front; forces in N, torques in N m.
 
     status        int32, a ``Status``: OPTIMAL, INFEASIBLE, STALLED or INVALID
     force         (*batch, k n) contact after contact in the chapter's component order: they balance the load, each in
-                  its cone; zero where INFEASIBLE
-    cost, bound   the criterion at ``force``, and a proven lower bound of every admissible force's cost; both
-                  infinite where INFEASIBLE
+                  its cone; zero where INFEASIBLE. ``jg.force_vectors`` gives them in body or world axes
+    lower, upper  the optimal cost lies between them: ``upper`` is the criterion at ``force``, ``lower`` a proven lower
+                  bound of every admissible force's cost; both infinite where INFEASIBLE
     escape_twist  (*batch, m) (velocity; angular velocity), unit norm: the proof of INFEASIBLE; else zero
-    load_twist    (*batch, m) derivative of the optimal cost with respect to the wrench: the twist behind ``bound``
+    load_twist    (*batch, m) derivative of the optimal cost with respect to the wrench: the twist behind ``lower``
     joint_rates   (*batch, q) multipliers of the torque limits; with them the twists prove what they prove
     smooth        bool: forces and multipliers are unique and strictly complementary, so that they have derivatives;
                   elsewhere their derivatives are one finite choice. False where not OPTIMAL
     iterations    int32 interior-point iterations spent
-    stop          int32, a ``solver.Stop``: why the iteration ended
-    wrench, criterion, max_normal, torque_limits, smoothing  the problem, as it was asked
+    stop          int32, a ``Status``: why the iteration ended
+    smoothing     the barrier parameter that was asked for
     """
 
     status: Int[Array, "*batch"]
     force: Float[Array, "*batch kn"]
-    cost: Float[Array, "*batch"]
-    bound: Float[Array, "*batch"]
+    upper: Float[Array, "*batch"]
+    lower: Float[Array, "*batch"]
     escape_twist: Float[Array, "*batch m"]
     load_twist: Float[Array, "*batch m"]
     joint_rates: Float[Array, "*batch q"]
     smooth: Bool[Array, "*batch"]
     iterations: Int[Array, "*batch"]
     stop: Int[Array, "*batch"]
-    wrench: Float[Array, "*batch m"]
-    criterion: Criterion
-    max_normal: Float[Array, "*batch k"] | None
-    torque_limits: tuple[Array, Array] | None
     smoothing: float = eqx.field(static=True, default=0.0)
+
+    SENTENCES: ClassVar[Mapping[Status, str]] = {
+        Status.OPTIMAL: "Optimal: the forces balance the load inside every cone, and the bound proves the cost.",
+        Status.INFEASIBLE: "Infeasible: no admissible forces balance the load; along the escape twist the load does "
+        "work that no force can take up.",
+        Status.STALLED: "Stalled: rounding stopped the solver before its gap or a proof of infeasibility; the best "
+        "forces and the gap reached are given.",
+        Status.INVALID: "Invalid: the numbers are not a grasp with a load, a criterion and limits.",
+    }
+
+    @property
+    def cost(self) -> Float[Array, "*batch"]:
+        """``h(force)``, the criterion at the forces given: ``upper``."""
+        return self.upper
 
     @property
     def gap(self) -> Float[Array, "*batch"]:
-        """``cost - bound``: no admissible force is cheaper by more; 0 where INFEASIBLE."""
-        same = self.cost == self.bound  # both may be infinite
-        return jnp.where(same, jnp.zeros_like(self.cost), self.cost - self.bound)
+        """``upper - lower``: no admissible force is cheaper by more; 0 where INFEASIBLE."""
+        same = self.upper == self.lower  # both may be infinite
+        return jnp.where(same, jnp.zeros_like(self.upper), self.upper - self.lower)
+
+    def values(self, index: int | tuple[int, ...] = ()) -> str:
+        """The bracket of one lane's cost in words."""
+        lower, upper = (np.asarray(x)[index] for x in (self.lower, self.upper))
+        return f"Cost between {lower:.6g} and {upper:.6g}." if np.isfinite(upper) else ""
 
 
 class _Plan(NamedTuple):
@@ -105,7 +130,7 @@ class _Progress(NamedTuple):
     """
 
     state: State
-    answer: Answer
+    answer: LaneAnswer
     smooth: Array
     scales: Scales | None
     multipliers: Array | None
@@ -138,9 +163,9 @@ def _tile_kernel(plan: _Plan) -> Callable[..., _Progress]:
 
 
 def _progress(
-    plan: _Plan, state: State, result: Answer, folded: Folded, projection: Projection, problem: Balance
+    plan: _Plan, state: State, result: LaneAnswer, folded: Folded, projection: Projection, problem: Balance
 ) -> _Progress:
-    optimal = (result.status == Status.OPTIMAL.value) & (state.stop != Stop.SKIPPED.value)
+    optimal = (result.status == Status.OPTIMAL.value) & (state.stop != Status.SKIPPED.value)
     smooth = optimal
     if problem.program.smoothing is None:
         smooth = optimal & regular(problem.program, state.point)
@@ -161,7 +186,7 @@ def _solve_rows(plan: _Plan, rows: Rows, count: Array, tolerance: Array) -> Solv
         return run(rows, progress.state, fresh, budget, tolerance)
 
     def unfinished(progress: _Progress) -> Array:
-        return progress.state.stop == Stop.RUNNING.value
+        return progress.state.stop == Status.RUNNING.value
 
     shapes = _shapes(plan, rows)
     state, answers, smooth, scales, y = in_sweeps(advance, rows, shapes, unfinished, count, 2, plan.width)
@@ -208,95 +233,18 @@ def _solved(plan: _Plan, rows: Rows, tolerance: Array) -> Solved:
 # The question --------------------------------------------------------------------------------------------
 
 
-def spread_loads(grasp: Grasp, wrench: Any) -> tuple[Array, tuple[int, ...]]:
-    """The wrench with all batch axes, and those axes: the grasp's, then any load axes."""
-    m, batch = wrench_dimension(grasp.dimension), grasp.batch_shape
-    array = real_array(wrench, "wrench").astype(grasp.dtype)
-    if array.ndim < 1 or array.shape[-1] != m:
-        raise ValueError(
-            f"wrench must have shape (*batch, *loads, {m}): (force; torque about the centre of mass), got {array.shape}"
-        )
-    lead = array.shape[:-1]
-    if not lead:
-        return jnp.broadcast_to(array, (*batch, m)), batch
-    if len(lead) < len(batch) or any(a not in (1, b) for a, b in zip(lead, batch, strict=False)):
-        raise ValueError(
-            f"the leading axes of wrench {array.shape} must start with the grasp's batch axes {batch} "
-            "(further axes are several loads for each grasp)"
-        )
-    shape = (*batch, *lead[len(batch) :])
-    return jnp.broadcast_to(array, (*shape, m)), shape
-
-
-def _spread(
-    value: Array, own: tuple[int, ...], batch: tuple[int, ...], shape: tuple[int, ...], name: str
-) -> Array:
-    """``value`` with trailing axes ``own`` broadcast over ``batch``, then over the load axes."""
-    loads = len(shape) - len(batch)
-    try:
-        full = jnp.broadcast_to(value, (*batch, *own))
-    except ValueError as error:
-        raise ValueError(f"{name} must broadcast to shape {(*batch, *own)}, got {value.shape}") from error
-    return jnp.broadcast_to(full.reshape(*batch, *([1] * loads), *own), (*shape, *own))
-
-
-def _weight(value: Array, batch: tuple[int, ...], shape: tuple[int, ...]) -> Array:
-    """One per problem: from one for all, one per grasp, or one per load."""
-    if value.ndim == len(shape) > len(batch):
-        return jnp.broadcast_to(value, shape)
-    return _spread(value, (), batch, shape, "the criterion's weight")
-
-
-def _demand(
-    grasp: Grasp,
-    wrench: Array,
-    shape: tuple[int, ...],
-    criterion: Criterion,
-    max_normal: Any,
-    torque_limits: Any,
-) -> tuple[Contacts, Demand]:
-    batch, k, dtype = grasp.batch_shape, grasp.contacts, grasp.dtype
-    n = grasp.model.force_size(grasp.dimension)
-    contacts = contacts_of(grasp)
-    spread = Contacts(*(_spread(x, x.shape[len(batch) :], batch, shape, "grasp") for x in contacts))
-    criterion = jax.tree.map(lambda x: _weight(x.astype(dtype), batch, shape), criterion)
-    log_det = None
-    if criterion.barrier_weight is not None:
-        terms = grasp.model.log_det_terms(grasp.dimension)
-        a, b, c = (_spread(x.astype(dtype), (k,), batch, shape, "grasp") for x in terms)
-        log_det = (a, b, c)
-    cap = None
-    if max_normal is not None:
-        cap = _spread(real_array(max_normal, "max_normal").astype(dtype), (k,), batch, shape, "max_normal")
-    jacobian = torque = None
-    if torque_limits is not None:
-        try:
-            jacobian, torque = torque_limits
-        except (TypeError, ValueError) as error:
-            raise ValueError(
-                f"torque_limits must be a pair (J, tau_max): J of shape (*batch, {k * n}, q) and tau_max (q)"
-            ) from error
-        jacobian = real_array(jacobian, "the hand Jacobian J").astype(dtype)
-        if jacobian.ndim < 2 or jacobian.shape[-2] != k * n:
-            raise ValueError(
-                f"the hand Jacobian J must have shape (*batch, {k * n}, q): one row for each force component "
-                f"({k} contacts of {n}), one column for each joint, got {jacobian.shape}"
-            )
-        joints = jacobian.shape[-1]
-        jacobian = _spread(jacobian, (k * n, joints), batch, shape, "the hand Jacobian J")
-        torque = _spread(real_array(torque, "tau_max").astype(dtype), (joints,), batch, shape, "tau_max")
-    return spread, Demand(wrench, criterion, log_det, cap, jacobian, torque)
-
-
 def optimize_forces(
     grasp: Grasp,
-    wrench: Float[Array, "*batch m"],
+    wrench: Float[ArrayLike, "*batch m"],
+    *,
     criterion: Criterion | None = None,
-    max_normal: Any = None,
-    torque_limits: tuple[Any, Any] | None = None,
+    max_normal: Float[ArrayLike, "*batch k"] | None = None,
+    torque_limits: TorqueLimits
+    | tuple[Float[ArrayLike, "*batch kn q"], Float[ArrayLike, "*batch q"]]
+    | None = None,
     tolerance: float = 1e-8,
     smoothing: float = 0.0,
-) -> ForceOptimum:
+) -> OptimalForces:
     """The least costly admissible contact forces that balance a load (section 11.3, Definition 5).
 
         min h(f)   subject to   f_i in C_i,  G f + wrench = 0,  f_n,i <= max_normal_i,  |J^T f| <= tau_max
@@ -308,7 +256,8 @@ def optimize_forces(
                    ``LeastNorm(length)``
     max_normal     N, a number or one per contact, infinite for none
     torque_limits  (J, tau_max): J (*batch, k n, q) maps joint rates to contact velocities in the contacts' own
-                   frames, so ``J^T f`` are the joint torques (N m); |J^T f| <= tau_max, (q) and positive
+                   frames, so ``J^T f`` are the joint torques (N m); |J^T f| <= tau_max, (q) and positive. For J in
+                   body or world axes: ``TorqueLimits(J, tau_max, axes="world", orientation=..)``
     tolerance      duality gap to reach, relative to the cost
     smoothing      barrier parameter, in units of the cost, at which to stop (default 0: the optimum itself). The
                    forces are then those of the smooth central path, whose derivatives have no kinks; ``gap`` says
@@ -320,7 +269,7 @@ def optimize_forces(
     is one finite choice, the limit along the central path; ``smoothing`` removes the kink. Lanes that are not OPTIMAL,
     and lanes without a load, have derivative 0.
 
-    Returns a ``ForceOptimum``. OPTIMAL comes with forces and a proven bound, INFEASIBLE with an escape twist; a lane
+    Returns ``OptimalForces``. OPTIMAL comes with forces and a proven bound, INFEASIBLE with an escape twist; a lane
     without either is STALLED, one with bad numbers INVALID. Nothing raises inside; wrong shapes raise ValueError.
     Sources: Buss, Hashimoto, Moore 1996; Han, Trinkle, Li 2000; Boyd, Wegbreit 2007.
     """
@@ -335,7 +284,7 @@ def optimize_forces(
         raise ValueError(f"smoothing must be a number of at least 0, got {smoothing!r}")
     components = grasp.model.components(grasp.dimension)
     loads, shape = spread_loads(grasp, wrench)
-    rows = _demand(grasp, loads, shape, criterion, max_normal, torque_limits)
+    rows = demand_rows(grasp, loads, shape, criterion, max_normal, torque_limits)
     demand = rows[1]
     if smoothing:
         demand = demand._replace(smoothing=jnp.full(shape, smoothing, grasp.dtype))
@@ -347,8 +296,7 @@ def optimize_forces(
     goal = jnp.maximum(jnp.asarray(tolerance, grasp.dtype), jnp.asarray(floor, grasp.dtype))
     solved = _solved(plan, rows, goal)
     a = solved.answer
-    limits = None if demand.jacobian is None or demand.torque is None else (demand.jacobian, demand.torque)
-    return ForceOptimum(
+    return OptimalForces(
         a.status, a.force, a.cost, a.bound, a.escape_twist, a.load_twist, a.joint_rates, solved.smooth,
-        solved.iterations, solved.stop, loads, demand.criterion, demand.cap, limits, float(smoothing),
+        solved.iterations, solved.stop, float(smoothing),
     )  # fmt: skip

@@ -19,10 +19,10 @@ FORMAT, VERSION = "jaxgrasp lane", 1
 _MODELS = {"Frictionless": Frictionless, "HardFinger": HardFinger, "SoftFinger": SoftFinger}
 
 
-def save_grasp(path: str | os.PathLike, grasp: Grasp) -> None:
+def save_grasp(grasp: Grasp, path: str | os.PathLike) -> None:
     """Write one grasp to ``path`` (.npz), bit for bit, for a bug report; ``load_grasp`` reads it back.
 
-    Index the batch for the failing lane: ``save_grasp("lane.npz", grasps[17])``. The file holds arrays and JSON, no
+    Index the batch for the failing lane: ``save_grasp(grasps[17], "lane.npz")``. The file holds arrays and JSON, no
     code; it is written beside and renamed.
     """
     path = Path(path)

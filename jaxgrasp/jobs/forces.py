@@ -20,10 +20,10 @@ import numpy as np
 import pyarrow as pa
 
 from ..backend import precision
-from ..certificates import check_certificate
+from ..certificates import check
 from ..contacts import Component, Grasp
 from ..core import Status, UserError, contact_frame, normalize
-from ..forces import ForceOptimum, closeness, optimize_forces
+from ..forces import OptimalForces, closeness, optimize_forces
 from ..formats import Contacts, Forces, as_row, force_schema, force_table, write
 from .load import LoadRun
 from .summary import Summary
@@ -112,24 +112,32 @@ def _solve(run: LoadRun, contacts: Contacts) -> _Solved:
     count = len(contacts)
     grasp = _grasp(run, _padded(contacts, run.chunk))
     started = time.perf_counter()
-    found: ForceOptimum = jax.block_until_ready(
+    found: OptimalForces = jax.block_until_ready(
         optimize_forces(
             grasp,
             jnp.asarray(run.load.wrench),
-            run.criterion,
+            criterion=run.criterion,
             max_normal=run.max_normal,
             tolerance=run.tolerance,
         )
     )
     seconds = time.perf_counter() - started
     values: dict[str, Any] = {
-        name: np.asarray(getattr(found, name))[:count]
+        name: np.asarray(getattr(found, {"bound": "lower"}.get(name, name)))[:count]
         for name in Forces.__dataclass_fields__
         if name != "contact_force"
     }
     values["contact_force"] = _in_mesh_axes(grasp, found.force)[:count]
     claims = np.isin(values["status"], (Status.OPTIMAL.value, Status.INFEASIBLE.value))
-    proved = claims & check_certificate(grasp, found, closeness(run.tolerance))[:count]
+    proved = check(
+        grasp,
+        found,
+        wrench=run.load.wrench,
+        criterion=run.criterion,
+        max_normal=run.max_normal,
+        tolerance=closeness(run.tolerance),
+    )
+    proved = claims & proved[:count]
     return _Solved(Forces(**values), proved, seconds)
 
 

@@ -11,7 +11,7 @@ and a killed run goes on where it was. A row depends on its grasp alone.
 The Parquet file has a row for each grasp:
 
     row, grasp_id   int64             in the source (a sampled grasp: its number)
-    verdict         int8              a ControllabilityVerdict
+    verdict         int8              a Status
     status          int8              a Status: wrench resistance
     rank            float64           of the controllability matrix, 12 where controllable; null where INVALID
     effort          float64           of the direction hardest to reach, in weights; null where not controllable
@@ -40,7 +40,7 @@ import pyarrow.parquet as pq
 
 from ..backend import precision
 from ..contacts import Grasp
-from ..core import UserError
+from ..core import Status, UserError
 from ..formats import Contacts, dump
 from ..motion import (
     BodyState,
@@ -48,8 +48,6 @@ from ..motion import (
     ComputedTorque,
     ContactController,
     Controllability,
-    ControllabilityVerdict,
-    ControlStatus,
     Gains,
     RigidBody,
     close_loop,
@@ -74,7 +72,7 @@ __all__ = [
 TIMESTEP, STEPS, RATE = 0.002, 800, 25.0  # s, -, 1/s
 PUSH, SHARE = (25, 50), 0.5  # steps of the push; its force in weights
 NEAR, LEVEL = 1e-3, np.radians(1.0)  # m, rad
-V = ControllabilityVerdict
+V = Status
 
 
 @dataclass(frozen=True)
@@ -238,7 +236,7 @@ def controllability_of(run: CheckRun, row: int) -> Controllability:
         if start <= row < stop:
             with precision("float64"):
                 grasp = _grasp(run, _first(load(), run.count - start))
-                found = controllability(grasp, run.body, run.gravity)
+                found = controllability(grasp, run.body, gravity=run.gravity)
             lane = slice(row - start, row - start + 1)
             return jax.tree.map(lambda x, lane=lane: x[lane], found)
     raise ValueError(f"there is no row {row}")
@@ -266,12 +264,12 @@ def _grasp(run: CheckRun, contacts: Contacts) -> Grasp:
 def _checked(run: CheckRun, contacts: Contacts) -> dict[str, np.ndarray]:
     """The columns of these rows, but their number."""
     grasp, body, gravity, count = _grasp(run, contacts), run.body, run.gravity, len(contacts)
-    found = controllability(grasp, body, gravity)
-    verdict = np.asarray(found.verdict)
+    found = controllability(grasp, body, gravity=gravity)
+    verdict = np.asarray(found.status)
     held = _disturbed(grasp, body, ComputedTorque(Gains.of_rate(RATE)), gravity)
     only = verdict == V.CONTROLLABLE.value
     if only.any():
-        keeper = regulator(grasp, body, TIMESTEP, gravity, found.force, effort=3.0)
+        keeper = regulator(grasp, body, timestep=TIMESTEP, gravity=gravity, force=found.force, effort=3.0)
         six = jax.tree.map(lambda x: jnp.repeat(x, 6, axis=0) if jnp.ndim(x) else x, keeper)
         other = _disturbed(grasp, body, six, gravity)
         held = {name: np.where(only, other[name], held[name]) for name in held}
@@ -279,7 +277,7 @@ def _checked(run: CheckRun, contacts: Contacts) -> dict[str, np.ndarray]:
     recovered = held["recovered"] & known
     columns = {
         "verdict": verdict,
-        "status": np.asarray(found.status),
+        "status": np.asarray(found.resistance),
         "rank": np.asarray(found.rank),
         "effort": np.asarray(found.effort),
         "weakest": np.asarray(found.uncontrollable),
@@ -302,10 +300,18 @@ def _disturbed(
     push[PUSH[0] : PUSH[1], :, :3] = SHARE * float(body.mass) * np.linalg.norm(gravity) * sides
     start = BodyState.at_rest(3, (6 * n,), grasp.dtype)
     out: ClosedLoop = close_loop(
-        lanes, body, controller, start, STEPS, TIMESTEP, None, np.tile(push, (1, n, 1)), gravity
+        lanes,
+        body,
+        controller=controller,
+        state=start,
+        steps=STEPS,
+        timestep=TIMESTEP,
+        reference=None,
+        disturbance=np.tile(push, (1, n, 1)),
+        gravity=gravity,
     )
     settled = np.asarray(out.settled(NEAR, float(LEVEL)))
-    fine = (ControlStatus.COMMANDED.value, ControlStatus.PROJECTED.value)
+    fine = (Status.COMMANDED.value, Status.PROJECTED.value)
     good = np.isin(np.asarray(out.status), fine).all(axis=0) & (settled < STEPS)
     use = np.asarray(out.cone_use).max(axis=0)
     return {
@@ -319,7 +325,7 @@ def _disturbed(
 def _table(columns: dict[str, np.ndarray], kind: pa.Schema) -> pa.Table:
     known = np.isin(columns["verdict"], (V.RESISTANT.value, V.CONTROLLABLE.value))
     missing = {
-        "rank": np.isnan(columns["rank"]),
+        "rank": columns["rank"] < 0,
         "effort": ~np.isfinite(columns["effort"]),
         "recovered": ~known,
         "settling_time": ~columns["recovered"],

@@ -193,9 +193,9 @@ def sdp_minimize(
     N, q = u.shape[-1], constant.shape[-1]
     expect_shape(constant.shape[-2:] == (q, q), "constant", "(*batch, q, q)", constant)
     expect_shape(matrices.shape[-3:] == (N, q, q), "matrices", f"(*batch, {N}, {q}, {q})", matrices)
-    phase = lmi_feasibility(constant, matrices, tolerance)
+    phase = lmi_feasibility(constant, matrices, tolerance=tolerance)
     start = jnp.where(phase.feasible[..., None], phase.x, jnp.nan)
-    end = lmi_minimize(LMIProblem(u, constant, matrices, start), tolerance)
+    end = lmi_minimize(LMIProblem(u, constant, matrices, start), tolerance=tolerance)
     infeasible = phase.infeasible
     batch = end.value.shape
     return SDPSolution(

@@ -162,5 +162,5 @@ def lmi_margin(grasp: Grasp, tolerance: float = 1e-8) -> Float[Array, "*batch"]:
     of t*; -inf where no internal force has ``sum f_n != 0``; NaN where the numbers are not a grasp.
     """
     problem, squeezes = _margin_problem(grasp)
-    margin = -lmi_minimize(problem, tolerance).value
+    margin = -lmi_minimize(problem, tolerance=tolerance).value
     return jnp.where(is_grasp(grasp), jnp.where(squeezes, margin, -jnp.inf), jnp.nan)

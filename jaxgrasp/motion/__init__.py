@@ -1,15 +1,9 @@
 """Section 11.4: the grasped body's dynamics, controllability, controllers, and closed loops with MuJoCo."""
 
 from .closed_loop import ClosedLoop, close_loop
-from .computed_torque import ComputedTorque, ContactController, ControlStatus, Gains, Reference
-from .controllability import (
-    Controllability,
-    ControllabilityVerdict,
-    controllability,
-    controllability_matrix,
-    gramian,
-)
-from .linearization import Linearization, OperatingPoint, linearize
+from .computed_torque import ComputedTorque, ContactController, Gains, Reference
+from .controllability import Controllability, controllability, controllability_matrix, gramian
+from .linearization import Linearization, linearize
 from .mujoco import MujocoPlant, mujoco_model, mujoco_plant
 from .regulator import Regulator, regulator
 from .rigid_body import (
@@ -28,13 +22,10 @@ __all__ = [
     "ClosedLoop",
     "ComputedTorque",
     "ContactController",
-    "ControlStatus",
     "Controllability",
-    "ControllabilityVerdict",
     "Gains",
     "Linearization",
     "MujocoPlant",
-    "OperatingPoint",
     "Reference",
     "Regulator",
     "RigidBody",

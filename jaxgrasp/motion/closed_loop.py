@@ -3,25 +3,38 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from ..contacts import Grasp, cone_use, grasp_map
-from ..core import Array, Float, Int, applied, real_array, rotate_wrench, wrench_dimension
-from .computed_torque import ContactController, ControlStatus, Reference, tracking_error
+from ..core import (
+    Answer,
+    Array,
+    Bool,
+    Float,
+    Int,
+    Status,
+    applied,
+    real_array,
+    rotate_wrench,
+    wrench_dimension,
+)
+from .computed_torque import ContactController, Reference, tracking_error
 from .mujoco import MujocoPlant
 from .rigid_body import BodyState, RigidBody, advance
 
 __all__ = ["ClosedLoop", "close_loop"]
 
 
-class ClosedLoop(eqx.Module):
+class ClosedLoop(Answer):
     """What happened, steps first: all of it is (T, *batch).
 
-    status          int32, a ``ControlStatus`` for each step
+    status          int32, a ``Status`` for each step
     position_error  m, ``|p - p_d|`` before the step; orientation_error: rad, ``|log(R R_d^T)|``
     cone_use        ``max_i psi_i / f_n,i`` of the applied forces: 1 at the edge of friction
     largest_normal  N, of the applied forces
@@ -38,10 +51,31 @@ class ClosedLoop(eqx.Module):
     states: BodyState | None
     force: Float[Array, "*lead kn"] | None
 
+    SENTENCES: ClassVar[Mapping[Status, str]] = {
+        Status.INFEASIBLE: "Infeasible: no admissible forces produce the commanded wrench; the last ones are kept.",
+        Status.UNDECIDED: "Undecided: the solver stopped before it had forces or a proof that there are none; the "
+        "last ones are kept.",
+        Status.INVALID: "Invalid: the numbers are not a grasp, a body and a state; no forces are applied.",
+    }
+
+    def __getitem__(self, index: Any) -> ClosedLoop:
+        """The loops at ``index`` of the batch, all steps of each."""
+        if len(self.batch_shape) < 2:
+            raise IndexError("a single loop has no batch axis to index")
+        final = jax.tree.map(lambda x: x[index], self.final)
+        index = (slice(None), *index) if isinstance(index, tuple) else (slice(None), index)
+        rest = eqx.tree_at(lambda loop: loop.final, self, None)
+        return eqx.tree_at(
+            lambda loop: loop.final,
+            jax.tree.map(lambda x: x[index], rest),
+            final,
+            is_leaf=lambda x: x is None,
+        )
+
     @property
-    def infeasible(self) -> Array:
+    def infeasible(self) -> Bool[Array, "*batch"]:
         """(*batch) bool: some step had no admissible forces for its command, or its forces were projected."""
-        return jnp.any(self.status != ControlStatus.COMMANDED.value, axis=0)
+        return jnp.any(self.status != Status.COMMANDED.value, axis=0)
 
     def settled(self, position: float, orientation: float) -> Int[Array, "*batch"]:
         """The first step from which both errors stay below ``position`` m and ``orientation`` rad; T if never."""
@@ -76,8 +110,8 @@ def _run(setting: _Setting, state: BodyState, reference: Reference, pushes, step
         now, last = carry
         target = at[0] if moving else reference
         command = controller.command(grasp, body, now, target, last, gravity)
-        invalid = ((command.status == ControlStatus.INVALID.value) | ~sound)[..., None]
-        status = jnp.where(sound, command.status, jnp.int32(ControlStatus.INVALID.value))
+        invalid = ((command.status == Status.INVALID.value) | ~sound)[..., None]
+        status = jnp.where(sound, command.status, jnp.int32(Status.INVALID.value))
         command = command._replace(force=jnp.where(invalid, 0.0, command.force), status=status)
         wrench = rotate_wrench(now.orientation, applied(G, command.force))
         if at[1] is not None:
@@ -121,13 +155,14 @@ def _laid_out(reference: Reference, batch: tuple[int, ...], steps: int, dtype) -
 def close_loop(
     grasp: Grasp,
     body: RigidBody,
+    *,
     controller: ContactController,
     state: BodyState,
     steps: int,
     timestep: float = 0.002,
     reference: Reference | None = None,
-    disturbance: Any = None,
-    gravity: Any = None,
+    disturbance: Float[ArrayLike, "*lead m"] | None = None,
+    gravity: Float[ArrayLike, "*batch d"] | None = None,
     plant: MujocoPlant | None = None,
     record: bool = False,
 ) -> ClosedLoop:

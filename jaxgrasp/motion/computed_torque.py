@@ -16,13 +16,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.typing import ArrayLike
 
 from ..contacts import Grasp, grasp_map, into_cones
 from ..core import (
     Array,
     Float,
     Int,
-    SpokenEnum,
     Status,
     applied,
     cross,
@@ -41,33 +41,12 @@ __all__ = [
     "Command",
     "ComputedTorque",
     "ContactController",
-    "ControlStatus",
     "Gains",
     "Reference",
     "tracking_error",
 ]
 
 CLOSE = 1e-6  # forces that miss the commanded wrench by less than this share of it produce it
-
-
-class ControlStatus(SpokenEnum):
-    """What became of the command in one step. Whatever it was, the applied forces lie in their cones."""
-
-    COMMANDED = (
-        1,
-        "The contact forces produce the commanded wrench, each inside its friction cone and limits.",
-    )
-    INFEASIBLE = 2, "No admissible forces produce the commanded wrench: the last admissible ones are kept."
-    PROJECTED = 3, "The commanded forces left their friction cones: the nearest admissible ones are applied."
-    UNSOLVED = (
-        4,
-        "The solver stopped before it had forces or a proof that there are none: the last ones are kept.",
-    )
-    INVALID = 5, "Invalid: the numbers are not a grasp, a body and a state; no forces are applied."
-    UNREGULATED = (
-        6,
-        "Unregulated: no equilibrium, or no feedback on its linearisation is stable; the equilibrium forces are kept.",
-    )
 
 
 class Gains(eqx.Module):
@@ -201,7 +180,7 @@ def tracking_error(state: BodyState, reference: Reference) -> TrackingError:
 
 
 class Command(NamedTuple):
-    """force (*batch, k n) in the cones; status int32, a ``ControlStatus``; wrench (*batch, m) asked for, body axes."""
+    """force (*batch, k n) in the cones; status int32, a ``Status``; wrench (*batch, m) asked for, body axes."""
 
     force: Array
     status: Array
@@ -264,7 +243,11 @@ class ComputedTorque(ContactController):
         self.gains.check(timestep, dimension)
 
     def wrench(
-        self, body: RigidBody, state: BodyState, reference: Reference, gravity: Any = None
+        self,
+        body: RigidBody,
+        state: BodyState,
+        reference: Reference,
+        gravity: Float[ArrayLike, "*batch d"] | None = None,
     ) -> Float[Array, "*batch m"]:
         """``M (q''_d - K_v e' - K_p e) + B + G`` in world axes, N and N m."""
         d = state.dimension
@@ -289,7 +272,12 @@ class ComputedTorque(ContactController):
         world = self.wrench(body, state, reference, gravity)
         asked = rotate_wrench(state.orientation, world, inverse=True)
         found = optimize_forces(
-            grasp, -asked, self.criterion, self.max_normal, self.torque_limits, tolerance=self.tolerance
+            grasp,
+            -asked,
+            criterion=self.criterion,
+            max_normal=self.max_normal,
+            torque_limits=self.torque_limits,
+            tolerance=self.tolerance,
         )
         cap = None if self.max_normal is None else self.max_normal.astype(asked.dtype)
         force = into_cones(grasp, found.force, cap)
@@ -302,9 +290,9 @@ def _settled(status: Int[Array, "*batch"], force: Array, close: Array, last: Arr
     """The forces of a solved step, or the last ones with the reason."""
     solved = (status == Status.OPTIMAL.value) | (status == Status.STALLED.value)
     good = solved & close
-    said = jnp.where(good, ControlStatus.COMMANDED.value, ControlStatus.UNSOLVED.value)
-    said = jnp.where(status == Status.INFEASIBLE.value, ControlStatus.INFEASIBLE.value, said)
+    said = jnp.where(good, Status.COMMANDED.value, Status.UNDECIDED.value)
+    said = jnp.where(status == Status.INFEASIBLE.value, Status.INFEASIBLE.value, said)
     invalid = status == Status.INVALID.value
-    said = jnp.where(invalid, ControlStatus.INVALID.value, said).astype(jnp.int32)
+    said = jnp.where(invalid, Status.INVALID.value, said).astype(jnp.int32)
     kept = jnp.where(good[..., None], force, last)
     return Command(jnp.where(invalid[..., None], 0.0, kept), said, asked)

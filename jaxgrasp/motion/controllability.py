@@ -14,20 +14,21 @@ linearised motion leaves a direction alone; gyroscopic or other second-order eff
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Mapping
+from typing import ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
 
 from ..contacts import Grasp
-from ..core import Array, Float, Int, SpokenEnum, Status, rank_tolerance, wrench_dimension
+from ..core import Answer, Array, Float, Int, Status, rank_tolerance, wrench_dimension
 from ..resistance import wrench_resistance
-from .linearization import OperatingPoint, Scaled, first_order, is_equilibrium, linearize, scaled_system
+from .linearization import Scaled, first_order, is_equilibrium, linearize, scaled_system
 from .rigid_body import RigidBody
 
 __all__ = [
     "Controllability",
-    "ControllabilityVerdict",
     "controllability",
     "controllability_matrix",
     "gramian",
@@ -36,46 +37,14 @@ __all__ = [
 HORIZON = 1.0  # of the Gramian, in units of sqrt(l / g)
 
 
-class ControllabilityVerdict(SpokenEnum):
-    """What is proven about steering the object with admissible contact forces."""
-
-    RESISTANT = (
-        1,
-        "Controllable, because the grasp is wrench resistant: the fingers alone produce every wrench.",
-    )
-    CONTROLLABLE = (
-        2,
-        (
-            "Controllable though not wrench resistant: with the forces strictly inside their cones, small changes of "
-            "them and gravity together reach every motion."
-        ),
-    )
-    MARGINAL = (
-        3,
-        (
-            "Open: the linearisation has full rank, but the only forces that carry the weight are at the edge of their "
-            "cones, so they may change one way only and the rank proves nothing."
-        ),
-    )
-    NOT_CONTROLLABLE = (
-        4,
-        "Not controllable to first order: no small change of the contact forces affects the uncontrollable motion.",
-    )
-    NO_EQUILIBRIUM = (
-        5,
-        "No equilibrium: no admissible contact forces carry the weight, or the given ones do not.",
-    )
-    UNDECIDED = 6, "Undecided: a solver stopped before it had a proof either way."
-    INVALID = 7, "Invalid: the numbers are not a grasp, a body and a gravity."
-
-
-class Controllability(eqx.Module):
+class Controllability(Answer):
     """Verdicts with their reasons, the batch axes in front. Scaled: lengths in l, times in sqrt(l / g), forces in m g.
 
-    verdict          int32, a ``ControllabilityVerdict``
-    rank             float, of the controllability matrix (11.30): 2 m where controllable; NaN where INVALID
-    reduced_rank     float, of [B_c A_c B_c] (11.32): m where controllable; NaN where INVALID
-    grasp_rank       float, of B_c alone: what the fingers do without gravity
+    status           int32, a ``Status``: RESISTANT, CONTROLLABLE, MARGINAL, NOT_CONTROLLABLE, NO_EQUILIBRIUM, UNDECIDED
+                     or INVALID
+    rank             int32, of the controllability matrix (11.30): 2 m where controllable; -1 where INVALID
+    reduced_rank     int32, of [B_c A_c B_c] (11.32): m where controllable; -1 where INVALID
+    grasp_rank       int32, of B_c alone: what the fingers do without gravity; -1 where INVALID
     singular_values  (*batch, m) of [B_c A_c B_c], scaled and folded, largest first
     uncontrollable   (*batch, m) (velocity; angular velocity), unit norm with lengths in l: where the rank is too low,
                      a motion on which neither the contact forces nor their turning with the body do work; where it is
@@ -84,22 +53,38 @@ class Controllability(eqx.Module):
                      that takes most effort to reach
     effort           (*batch) that effort: the least root mean square of all scaled contact forces, in weights, that
                      moves the object there in the time sqrt(l / g); infinite where not controllable
-    point            int32, an ``OperatingPoint``: the equilibrium
-    status           int32, a ``Status``: wrench resistance
+    equilibrium      int32, a ``Status``: the equilibrium, as ``linearize`` says it
+    resistance       int32, a ``Status``: wrench resistance
     force            (*batch, k n) N: the equilibrating forces, zero where there are none
     """
 
-    verdict: Int[Array, "*batch"]
-    rank: Float[Array, "*batch"]
-    reduced_rank: Float[Array, "*batch"]
-    grasp_rank: Float[Array, "*batch"]
+    status: Int[Array, "*batch"]
+    rank: Int[Array, "*batch"]
+    reduced_rank: Int[Array, "*batch"]
+    grasp_rank: Int[Array, "*batch"]
     singular_values: Float[Array, "*batch m"]
     uncontrollable: Float[Array, "*batch m"]
     weakest: Float[Array, "*batch s"]
     effort: Float[Array, "*batch"]
-    point: Int[Array, "*batch"]
-    status: Int[Array, "*batch"]
+    equilibrium: Int[Array, "*batch"]
+    resistance: Int[Array, "*batch"]
     force: Float[Array, "*batch kn"]
+
+    SENTENCES: ClassVar[Mapping[Status, str]] = {
+        Status.RESISTANT: "Controllable, because the grasp is wrench resistant: the fingers alone produce every "
+        "wrench.",
+        Status.MARGINAL: "Open: the linearisation has full rank, but the only forces that carry the weight are at the "
+        "edge of their cones, so they may change one way only and the rank proves nothing.",
+        Status.NO_EQUILIBRIUM: "No equilibrium: no admissible contact forces carry the weight, or the given ones do "
+        "not.",
+        Status.UNDECIDED: "Undecided: a solver stopped before it had a proof either way.",
+        Status.INVALID: "Invalid: the numbers are not a grasp, a body and a gravity.",
+    }
+
+    def values(self, index: int | tuple[int, ...] = ()) -> str:
+        """Rank and effort of one lane in words."""
+        rank, effort = (np.asarray(x)[index] for x in (self.rank, self.effort))
+        return "" if rank < 0 else f"Rank {rank}, effort {effort:.4g} weights."
 
 
 def controllability_matrix(
@@ -113,7 +98,9 @@ def controllability_matrix(
 
 
 def gramian(
-    A: Float[Array, "*batch s s"], B: Float[Array, "*batch s n"], horizon: Any = HORIZON
+    A: Float[Array, "*batch s s"],
+    B: Float[Array, "*batch s n"],
+    horizon: Float[ArrayLike, "*batch"] = HORIZON,
 ) -> Float[Array, "*batch s s"]:
     """``W = int_0^T e^(A t) B B^T e^(A^T t) dt`` of a grasp's linearisation: exact, because A^4 = 0.
 
@@ -136,14 +123,15 @@ def _rank(matrix: Array, tolerance: float) -> tuple[Array, Array]:
     values = jnp.linalg.svd(matrix, compute_uv=False)
     missing = matrix.shape[-2] - values.shape[-1]
     values = jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, max(missing, 0))])
-    return jnp.sum(values > tolerance * values[..., :1], axis=-1).astype(matrix.dtype), values
+    return jnp.sum(values > tolerance * values[..., :1], axis=-1).astype(jnp.int32), values
 
 
 def controllability(
     grasp: Grasp,
     body: RigidBody,
-    gravity: Any = None,
-    force: Any = None,
+    *,
+    gravity: Float[ArrayLike, "*batch d"] | None = None,
+    force: Float[ArrayLike, "*batch kn"] | None = None,
     tolerance: float = 1e-8,
 ) -> Controllability:
     """``rank [B_c A_c B_c] = m`` (11.32), the equilibrium it is about, and what both together prove.
@@ -153,14 +141,14 @@ def controllability(
     force      (*batch, k n) the equilibrating forces; None: looked for, strictly inside the cones if there are any
     tolerance  of the solvers behind the equilibrium and the wrench resistance
 
-    Rank counts singular values above ``_types.rank_tolerance`` times the largest one. Nothing raises inside; wrong
+    Rank counts singular values above 64 eps times the largest one. Nothing raises inside; wrong
     shapes raise ValueError. Sources: (11.29)-(11.33) with errata 9 and 10; Kalman 1963.
     """
-    linear = linearize(grasp, body, force, gravity, tolerance)
-    resistance = wrench_resistance(grasp, tolerance, verdict_only=True)
-    status = jnp.broadcast_to(resistance.status, linear.point.shape)
+    linear = linearize(grasp, body, force=force, gravity=gravity, tolerance=tolerance)
+    resistance = wrench_resistance(grasp, tolerance=tolerance, verdict_only=True)
+    status = jnp.broadcast_to(resistance.status, linear.status.shape)
     system = scaled_system(grasp, body, gravity)
-    broken = (linear.point == OperatingPoint.INVALID.value)[..., None, None]
+    broken = (linear.status == Status.INVALID.value)[..., None, None]
     system = system._replace(B_c=jnp.where(broken, 0.0, system.B_c), A_c=jnp.where(broken, 0.0, system.A_c))
     m, cut = system.A_c.shape[-1], rank_tolerance(system.A_c.dtype)
 
@@ -171,43 +159,43 @@ def controllability(
     rank, _ = _rank(controllability_matrix(A, B)[..., : 4 * B.shape[-1]], cut)  # A^4 = 0
 
     full = reduced_rank == m
-    verdict = _verdict(linear.point, status, full)
-    unknown = verdict == ControllabilityVerdict.INVALID.value
+    verdict = _verdict(linear.status, status, full)
+    unknown = verdict == Status.INVALID.value
     motion = _least_worked(reduced, body, system)
     weakest, effort = _weakest(A, B, system)
     none = unknown[..., None]
     return Controllability(
         verdict,
-        jnp.where(unknown, jnp.nan, rank),
-        jnp.where(unknown, jnp.nan, reduced_rank),
-        jnp.where(unknown, jnp.nan, alone),
+        jnp.where(unknown, -1, rank),
+        jnp.where(unknown, -1, reduced_rank),
+        jnp.where(unknown, -1, alone),
         jnp.where(none, jnp.nan, values),
         jnp.where(none, 0.0, motion),
         jnp.where(none, 0.0, weakest),
         jnp.where(full & ~unknown, effort, jnp.inf),
-        linear.point,
+        linear.status,
         status,
         linear.force,
     )
 
 
 def _verdict(point: Array, status: Array, full: Array) -> Array:
-    verdict = jnp.full(point.shape, ControllabilityVerdict.UNDECIDED.value, jnp.int32)
+    verdict = jnp.full(point.shape, Status.UNDECIDED.value, jnp.int32)
 
-    def choose(where: Array, value: ControllabilityVerdict) -> None:
+    def choose(where: Array, value: Status) -> None:
         nonlocal verdict
         verdict = jnp.where(where, jnp.int32(value.value), verdict)
 
-    choose((point == OperatingPoint.MARGINAL.value) & full, ControllabilityVerdict.MARGINAL)
-    choose((point == OperatingPoint.NON_MARGINAL.value) & full, ControllabilityVerdict.CONTROLLABLE)
+    choose((point == Status.MARGINAL.value) & full, Status.MARGINAL)
+    choose((point == Status.NON_MARGINAL.value) & full, Status.CONTROLLABLE)
     known = is_equilibrium(point)
-    choose(known & ~full, ControllabilityVerdict.NOT_CONTROLLABLE)
+    choose(known & ~full, Status.NOT_CONTROLLABLE)
     # an internal force moves any equilibrium of a resistant grasp inside the cones
-    choose(known & full & (status == Status.RESISTANT.value), ControllabilityVerdict.RESISTANT)
-    absent = (point == OperatingPoint.NO_EQUILIBRIUM.value) | (point == OperatingPoint.NOT_BALANCED.value)
-    choose(absent, ControllabilityVerdict.NO_EQUILIBRIUM)
-    invalid = (point == OperatingPoint.INVALID.value) | (status == Status.INVALID.value)
-    choose(invalid, ControllabilityVerdict.INVALID)
+    choose(known & full & (status == Status.RESISTANT.value), Status.RESISTANT)
+    absent = (point == Status.NO_EQUILIBRIUM.value) | (point == Status.NOT_BALANCED.value)
+    choose(absent, Status.NO_EQUILIBRIUM)
+    invalid = (point == Status.INVALID.value) | (status == Status.INVALID.value)
+    choose(invalid, Status.INVALID)
     return verdict
 
 

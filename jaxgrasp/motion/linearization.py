@@ -11,31 +11,33 @@ carry the weight turn with the body. A and B do not depend on which equilibratin
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from ..contacts import Grasp, folded_grasp_map, grasp_map, length_scale
 from ..core import (
+    Answer,
     Array,
     Bool,
     Float,
     Int,
-    SpokenEnum,
+    Status,
     applied,
     balance_tolerance,
     real_array,
     skew,
     wrench_dimension,
 )
-from ..forces import EquilibriumKind, equilibrium
+from ..forces import equilibrium
 from .rigid_body import RigidBody, gravity_vector
 
 __all__ = [
     "Linearization",
-    "OperatingPoint",
     "Scaled",
     "first_order",
     "is_equilibrium",
@@ -44,41 +46,31 @@ __all__ = [
 ]
 
 
-class OperatingPoint(SpokenEnum):
-    """What a grasp was linearised about."""
-
-    NON_MARGINAL = (
-        1,
-        "Non-marginal equilibrium: forces strictly inside every friction cone, so small changes of them are free.",
-    )
-    MARGINAL = (
-        2,
-        "Marginal equilibrium: some contact is at the edge of its friction cone, so its force may change one way only.",
-    )
-    NO_EQUILIBRIUM = 3, "No equilibrium: no admissible contact forces carry the weight."
-    NOT_BALANCED = (
-        4,
-        "The given forces are no equilibrium: they do not carry the weight, or leave their cones.",
-    )
-    UNDECIDED = 5, "Undecided: the solver stopped before it found forces or a proof that there are none."
-    INVALID = 6, "Invalid: the numbers are not a grasp, a body and a gravity."
-
-
-class Linearization(eqx.Module):
+class Linearization(Answer):
     """A and B of (11.29), and the equilibrium they belong to.
 
-    point   int32, an ``OperatingPoint``; A and B are zero where there is no equilibrium
+    status  int32, a ``Status``: NON_MARGINAL, MARGINAL, NO_EQUILIBRIUM, NOT_BALANCED (the given forces), UNDECIDED or
+            INVALID; A and B are zero where there is no equilibrium
     A       (*batch, 2 m, 2 m)
     B       (*batch, 2 m, k n): columns of components that do not exist (mu = 0, gamma = 0, inactive) are zero
     force   (*batch, k n) the equilibrating contact forces, N and N m; zero where there are none
     slack   (*batch) N: ``min_i f_n,i - psi_i(f_i)`` of ``force``
     """
 
-    point: Int[Array, "*batch"]
+    status: Int[Array, "*batch"]
     A: Float[Array, "*batch s s"]
     B: Float[Array, "*batch s kn"]
     force: Float[Array, "*batch kn"]
     slack: Float[Array, "*batch"]
+
+    SENTENCES: ClassVar[Mapping[Status, str]] = {
+        Status.NON_MARGINAL: "Non-marginal equilibrium: forces strictly inside every friction cone, so small "
+        "changes of them are free.",
+        Status.MARGINAL: "Marginal equilibrium: some contact is at the edge of its friction cone, so its force may "
+        "change one way only.",
+        Status.NO_EQUILIBRIUM: "No equilibrium: no admissible contact forces carry the weight.",
+        Status.INVALID: "Invalid: the numbers are not a grasp, a body and a gravity.",
+    }
 
 
 def _spread(grasp: Grasp, body: RigidBody) -> tuple[Grasp, RigidBody]:
@@ -106,19 +98,6 @@ def _spread(grasp: Grasp, body: RigidBody) -> tuple[Grasp, RigidBody]:
     return spread, jax.tree.map(lambda x: wide(x.astype(dtype), other), body)
 
 
-def _kinds(kind: Array) -> Array:
-    """``EquilibriumKind`` to ``OperatingPoint``."""
-    point = jnp.full(kind.shape, OperatingPoint.UNDECIDED.value, jnp.int32)
-    for found, means in (
-        (EquilibriumKind.NONE, OperatingPoint.NO_EQUILIBRIUM),
-        (EquilibriumKind.MARGINAL, OperatingPoint.MARGINAL),
-        (EquilibriumKind.NON_MARGINAL, OperatingPoint.NON_MARGINAL),
-        (EquilibriumKind.INVALID, OperatingPoint.INVALID),
-    ):
-        point = jnp.where(kind == found.value, jnp.int32(means.value), point)
-    return point
-
-
 def _judged(grasp: Grasp, load: Array, force: Array) -> tuple[Array, Array]:
     """What given forces are, and their slack."""
     d, n = grasp.dimension, grasp.model.force_size(grasp.dimension)
@@ -131,16 +110,16 @@ def _judged(grasp: Grasp, load: Array, force: Array) -> tuple[Array, Array]:
     allowed = balance_tolerance(grasp.dtype) * largest
     idle = jnp.all(jnp.where(grasp.active[..., None], 0.0, parts) == 0, axis=(-1, -2))
     balanced = (jnp.max(jnp.abs(left * per_length), axis=-1) <= allowed) & idle
-    point = jnp.where(slack > allowed, OperatingPoint.NON_MARGINAL.value, OperatingPoint.MARGINAL.value)
+    point = jnp.where(slack > allowed, Status.NON_MARGINAL.value, Status.MARGINAL.value)
     bad = ~balanced | (slack < -allowed)
-    point = jnp.where(bad, OperatingPoint.NOT_BALANCED.value, point).astype(jnp.int32)
+    point = jnp.where(bad, Status.NOT_BALANCED.value, point).astype(jnp.int32)
     finite = jnp.all(jnp.isfinite(force), axis=-1)
-    return jnp.where(finite, point, jnp.int32(OperatingPoint.INVALID.value)), slack
+    return jnp.where(finite, point, jnp.int32(Status.INVALID.value)), slack
 
 
 def is_equilibrium(point: Int[Array, "*batch"]) -> Bool[Array, "*batch"]:
-    """Whether an ``OperatingPoint`` is an equilibrium, marginal or not."""
-    return (point == OperatingPoint.NON_MARGINAL.value) | (point == OperatingPoint.MARGINAL.value)
+    """Whether a ``Status`` is an equilibrium, marginal or not."""
+    return (point == Status.NON_MARGINAL.value) | (point == Status.MARGINAL.value)
 
 
 def first_order(
@@ -155,8 +134,9 @@ def first_order(
 def linearize(
     grasp: Grasp,
     body: RigidBody,
-    force: Any = None,
-    gravity: Any = None,
+    *,
+    force: Float[ArrayLike, "*batch kn"] | None = None,
+    gravity: Float[ArrayLike, "*batch d"] | None = None,
     tolerance: float = 1e-8,
 ) -> Linearization:
     """``x' = A x + B f~`` (11.29) about the equilibrium in which contact forces carry the body's weight.
@@ -167,7 +147,7 @@ def linearize(
     gravity  m/s^2 in the axes of the grasp, one vector or one a lane; None: 9.81 along -z, in the plane along -y
 
     Works under ``jax.jit`` and ``jax.vmap``; A and B are differentiable. A lane without equilibrium, or with bad
-    numbers, says so in ``point``; wrong shapes raise ValueError.
+    numbers, says so in ``status``; wrong shapes raise ValueError.
     """
     grasp, body = _spread(grasp, body)
     d, m, dtype = grasp.dimension, wrench_dimension(grasp.dimension), grasp.dtype
@@ -178,8 +158,8 @@ def linearize(
     weight = body.mass[..., None] * g
     load = jnp.concatenate([weight, jnp.zeros((*weight.shape[:-1], m - d), dtype)], axis=-1)
     if force is None:
-        found = equilibrium(grasp, load, tolerance)
-        point, slack, forces = _kinds(found.kind), found.slack, found.force
+        found = equilibrium(grasp, load, tolerance=tolerance)
+        point, slack, forces = found.status, found.slack, found.force
     else:
         forces = real_array(force, "force").astype(dtype)
         size = grasp.contacts * grasp.model.force_size(d)
@@ -191,8 +171,8 @@ def linearize(
         forces = jnp.broadcast_to(forces, (*grasp.batch_shape, size))
         point, slack = _judged(grasp, load, forces)
         good = _good_numbers(grasp)
-        point = jnp.where(good, point, jnp.int32(OperatingPoint.INVALID.value))
-    point = jnp.where(fit, point, jnp.int32(OperatingPoint.INVALID.value))
+        point = jnp.where(good, point, jnp.int32(Status.INVALID.value))
+    point = jnp.where(fit, point, jnp.int32(Status.INVALID.value))
     there = is_equilibrium(point)
     A, B = first_order(*_blocks(_sound(grasp), body, g))
     keep = there[..., None, None]

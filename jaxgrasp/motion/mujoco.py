@@ -17,6 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from ..contacts import Grasp
 from ..core import Array, Float, applied, rotate, rotation_between, turned
@@ -52,7 +53,12 @@ def _words(values: Any) -> str:
     return " ".join(repr(float(x)) for x in np.asarray(values).ravel())
 
 
-def mujoco_model(body: RigidBody, timestep: float = 0.002, gravity: Any = None, mesh: Any = None) -> Any:
+def mujoco_model(
+    body: RigidBody,
+    timestep: float = 0.002,
+    gravity: Float[ArrayLike, "*batch d"] | None = None,
+    mesh: Any = None,
+) -> Any:
     """A ``mujoco.MjModel`` of one body: mass, inertia, free joint, no contacts; semi-implicit Euler of ``timestep`` s.
 
     mesh  a ``trimesh.Trimesh`` in body axes (origin at the centre of mass, m) to look at; it takes no part in contacts
@@ -219,7 +225,9 @@ def _principal(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return moments, chosen / np.linalg.norm(chosen, axis=-1, keepdims=True)
 
 
-def mujoco_plant(body: RigidBody, timestep: float = 0.002, gravity: Any = None) -> MujocoPlant:
+def mujoco_plant(
+    body: RigidBody, timestep: float = 0.002, gravity: Float[ArrayLike, "*batch d"] | None = None
+) -> MujocoPlant:
     """MJX models of all bodies of a batch, semi-implicit Euler steps of ``timestep`` s, gravity in m/s^2, world axes.
 
     The body must be concrete (its principal axes are found once, on the host) and valid in every lane.
@@ -229,7 +237,7 @@ def mujoco_plant(body: RigidBody, timestep: float = 0.002, gravity: Any = None) 
         bad = np.argwhere(~np.asarray(body.valid))[0].tolist()
         raise ValueError(f"body {bad} is none (mass or inertia): leave it out, or see RigidBody.valid")
     first = jax.tree.map(lambda x: x[(0,) * len(body.batch_shape)], body)
-    host = mujoco_model(first, timestep, gravity)
+    host = mujoco_model(first, timestep=timestep, gravity=gravity)
     mjx, shape, dtype = _mjx(), body.batch_shape, body.dtype
     model = mjx.put_model(host, impl="jax")
     moments, axes = _principal(np.asarray(body.inertia, np.float64).reshape(-1, 3, 3))

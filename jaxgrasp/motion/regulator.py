@@ -15,11 +15,12 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
+from jax.typing import ArrayLike
 
 from ..contacts import Grasp, grasp_map, nearest_admissible
-from ..core import Array, Bool, Float, Int, applied
-from .computed_torque import Command, ContactController, ControlStatus, Reference, tracking_error
-from .linearization import OperatingPoint, Scaled, is_equilibrium, linearize, scaled_system
+from ..core import Array, Bool, Float, Int, Status, applied
+from .computed_torque import Command, ContactController, Reference, tracking_error
+from .linearization import Scaled, is_equilibrium, linearize, scaled_system
 from .rigid_body import BodyState, RigidBody
 
 __all__ = ["Regulator", "regulator", "riccati"]
@@ -52,7 +53,7 @@ class Regulator(ContactController):
 
     force       (*batch, k n) f_0, N       gain  (*batch, k n, 2 m) K: N for m, rad, m/s, rad/s
     stabilizes  (*batch) bool: A - B K is stable; elsewhere K = 0 and every step says UNREGULATED
-    point       int32, an ``OperatingPoint``: the equilibrium
+    point       int32, an ``Status``: the equilibrium
     timestep    s, the step the gain was made for
     """
 
@@ -78,10 +79,10 @@ class Regulator(ContactController):
         wanted = self.force - applied(self.gain, x)
         force = nearest_admissible(grasp, wanted)
         change, size = jnp.max(jnp.abs(force - wanted), axis=-1), jnp.max(jnp.abs(wanted), axis=-1)
-        said = jnp.where(change <= 1e-9 * size, ControlStatus.COMMANDED.value, ControlStatus.PROJECTED.value)
-        said = jnp.where(self.stabilizes, said, ControlStatus.UNREGULATED.value)
-        bad = ~jnp.all(jnp.isfinite(x), axis=-1) | (self.point == OperatingPoint.INVALID.value)
-        said = jnp.where(bad, ControlStatus.INVALID.value, said).astype(jnp.int32)
+        said = jnp.where(change <= 1e-9 * size, Status.COMMANDED.value, Status.PROJECTED.value)
+        said = jnp.where(self.stabilizes, said, Status.UNREGULATED.value)
+        bad = ~jnp.all(jnp.isfinite(x), axis=-1) | (self.point == Status.INVALID.value)
+        said = jnp.where(bad, Status.INVALID.value, said).astype(jnp.int32)
         asked = applied(grasp_map(grasp), wanted)
         return Command(jnp.where(bad[..., None], 0.0, force), said, asked)
 
@@ -123,9 +124,10 @@ def _design(grasp: Grasp, system: Scaled, timestep: Array, weight: float) -> tup
 def regulator(
     grasp: Grasp,
     body: RigidBody,
+    *,
     timestep: float = 0.002,
-    gravity: Any = None,
-    force: Any = None,
+    gravity: Float[ArrayLike, "*batch d"] | None = None,
+    force: Float[ArrayLike, "*batch kn"] | None = None,
     effort: float = 1.0,
 ) -> Regulator:
     """``f = f_0 - K x`` that brings every state near the equilibrium back, as far as friction cones allow.
@@ -140,9 +142,9 @@ def regulator(
         raise ValueError(f"effort must be a positive number, got {effort!r}")
     if not timestep > 0:
         raise ValueError(f"timestep must be positive, got {timestep}")
-    linear = linearize(grasp, body, force, gravity)
+    linear = linearize(grasp, body, force=force, gravity=gravity)
     system = scaled_system(grasp, body, gravity)
     gain, stable = _design(grasp, system, jnp.asarray(timestep, system.A_c.dtype), effort * effort)
-    good = is_equilibrium(linear.point) & stable
+    good = is_equilibrium(linear.status) & stable
     gain = jnp.where(good[..., None, None], gain, 0.0)
-    return Regulator(linear.force, gain, good, linear.point, float(timestep))
+    return Regulator(linear.force, gain, good, linear.status, float(timestep))

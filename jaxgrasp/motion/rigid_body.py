@@ -13,6 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.typing import ArrayLike
 
 from ..contacts import Grasp, grasp_map
 from ..core import (
@@ -253,7 +254,9 @@ def coriolis(body: RigidBody, state: BodyState) -> Float[Array, "*batch m"]:
     return jnp.concatenate([jnp.zeros_like(torque), torque], axis=-1)
 
 
-def gravity_term(body: RigidBody, gravity: Any = None) -> Float[Array, "*batch m"]:
+def gravity_term(
+    body: RigidBody, gravity: Float[ArrayLike, "*batch d"] | None = None
+) -> Float[Array, "*batch m"]:
     """``G(q) = m_B g grad h = (-m_B gravity; 0)`` (11.23) in N: what the fingers must hold up."""
     d = body.dimension
     g = gravity_vector(gravity, d, body.dtype)
@@ -272,7 +275,10 @@ def world_grasp_map(grasp: Grasp, orientation: Float[Array, "*batch o"]) -> Floa
 
 
 def acceleration(
-    body: RigidBody, state: BodyState, wrench: Float[Array, "*batch m"], gravity: Any = None
+    body: RigidBody,
+    state: BodyState,
+    wrench: Float[Array, "*batch m"],
+    gravity: Float[ArrayLike, "*batch d"] | None = None,
 ) -> Float[Array, "*batch m"]:
     """``q'' = M^-1 (w - B - G)`` (11.21): m/s^2 and rad/s^2, world axes, under ``wrench`` (world axes, N, N m)."""
     d = state.dimension
@@ -293,7 +299,7 @@ def advance(
     state: BodyState,
     wrench: Float[Array, "*batch m"],
     timestep: float | Array,
-    gravity: Any = None,
+    gravity: Float[ArrayLike, "*batch d"] | None = None,
 ) -> BodyState:
     """One semi-implicit Euler step of ``timestep`` s: ``v+ = v + h q''(q, v)``, ``q+ = q moved by h v+``.
 

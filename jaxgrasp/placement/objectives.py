@@ -202,7 +202,7 @@ class Epsilon(Objective):
         return _smallest(self._supports(grasp, memory))
 
     def final(self, grasp: Grasp) -> Float[Array, " B"]:
-        return epsilon_quality(grasp, self.norm, self.torque_scale).upper
+        return epsilon_quality(grasp, norm=self.norm, torque_scale=self.torque_scale).upper
 
 
 @functools.partial(jax.jit, static_argnums=1)

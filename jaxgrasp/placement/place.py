@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from ..certificates import check_certificate
+from ..certificates import check
 from ..contacts import ContactModel, Grasp, HardFinger
 from ..core import Array, Status, UserError
 from ..resistance import WrenchResistance, wrench_resistance
@@ -290,7 +290,7 @@ def _exact(task: _Task, objective: Objective, position: np.ndarray, normal: np.n
         rows = np.minimum(np.arange(-(-count // GROUP) * GROUP), count - 1).reshape(-1, GROUP)
         some = [grasp[group] for group in rows]
         value = np.concatenate([objective.value(g, lessons(objective, g)) for g in some])[:count]
-    return _Exact(position, normal, verdict, check_certificate(grasp, verdict), excess, value)
+    return _Exact(position, normal, verdict, check(grasp, verdict), excess, value)
 
 
 def _settled(task: _Task, objective: Objective, exact: _Exact) -> _Exact:

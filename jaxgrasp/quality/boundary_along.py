@@ -29,7 +29,9 @@ def facet_normal(
     """
     force = jnp.arange(direction.shape[-1], dtype=jnp.int32) < grasp.dimension
     scale = jnp.where(force, 1.0, length[..., None])[:, None]
-    found = optimize_forces(grasp, -direction * scale, SmallestSum() if norm == "L1" else Gentlest())
+    found = optimize_forces(
+        grasp, -direction * scale, criterion=SmallestSum() if norm == "L1" else Gentlest()
+    )
     held = (found.status == Status.OPTIMAL.value)[..., None]
     normal = -scale * jnp.where(held, found.load_twist, found.escape_twist)
     square = jnp.sum(normal * normal, axis=-1, keepdims=True)

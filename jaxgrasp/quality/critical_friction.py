@@ -9,17 +9,18 @@ implicit function, d alpha* = -(dt* / dtheta) / (dt* / dalpha) dtheta, and of an
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.core import Tracer
+from jax.typing import ArrayLike
 
 from ..contacts import ContactModel, Grasp
-from ..core import Array, Float, Status
+from ..core import Answer, Array, Float, Int, Status
 from ..resistance import WrenchResistance, wrench_resistance
 
 __all__ = ["CriticalFriction", "critical_friction", "friction_sweep", "with_friction_factor"]
@@ -29,21 +30,35 @@ HALVED, ROUNDS = 6, 70
 SLOPE_TOLERANCE = 1e-12  # of the margin whose derivatives make the factor's: they are good to about its root
 
 
-class CriticalFriction(eqx.Module):
+class CriticalFriction(Answer):
     """The critical factor of each grasp between two proven ends; no unit.
 
+    status           int32, a ``Status`` of the grasp as it is: RESISTANT (upper <= 1), NOT_RESISTANT (lower >= 1),
+                     MARGINAL where 1 lies between, INVALID
     factor           (*batch) alpha*; 0 where any friction will do, infinite where none up to 1e6 does, NaN where
                      INVALID. ``factor * mu`` is the least friction; above 1 the grasp does not hold as it is
     lower, upper     (*batch) not resistant at ``lower``, resistant at ``upper``: verdicts with certificates for
                      ``with_friction_factor(grasp, lower)`` and the same with ``upper``
     """
 
+    status: Int[Array, "*batch"]
     factor: Float[Array, "*batch"]
     lower: Float[Array, "*batch"]
     upper: Float[Array, "*batch"]
 
+    SENTENCES: ClassVar[Mapping[Status, str]] = {
+        Status.RESISTANT: "Holds as it is: less friction would do.",
+        Status.NOT_RESISTANT: "Does not hold as it is: it needs more friction, or no friction is enough.",
+        Status.MARGINAL: "Marginal: the friction it has is what it needs, to within the tolerance.",
+    }
 
-def with_friction_factor(grasp: Grasp, factor: Any) -> Grasp:
+    def values(self, index: int | tuple[int, ...] = ()) -> str:
+        """The factor of one lane in words."""
+        factor = np.asarray(self.factor)[index]
+        return "" if np.isnan(factor) else f"It holds from {factor:.6g} times its friction on."
+
+
+def with_friction_factor(grasp: Grasp, factor: Float[ArrayLike, "*batch"]) -> Grasp:
     """The grasp with ``factor * mu`` for every mu, gamma unchanged; ``factor`` a number or one a grasp."""
     scale = jnp.asarray(factor, grasp.dtype)
     scale = jnp.broadcast_to(scale, grasp.batch_shape)[..., None]
@@ -52,7 +67,9 @@ def with_friction_factor(grasp: Grasp, factor: Any) -> Grasp:
     return Grasp(grasp.position, grasp.normal, changed, grasp.active)
 
 
-def friction_sweep(grasp: Grasp, factors: Float[Array, " T"], verdict_only: bool = False) -> WrenchResistance:
+def friction_sweep(
+    grasp: Grasp, factors: Float[ArrayLike, " T"], *, verdict_only: bool = False
+) -> WrenchResistance:
     """The verdicts at each of T factors on all mu, in one call: a ``WrenchResistance`` with batch axes (*batch, T)."""
     array = jnp.asarray(factors, grasp.dtype)
     if array.ndim != 1:
@@ -80,7 +97,7 @@ def _margin(grasp: Grasp, log_factor: Array) -> Array:
     margin = jnp.where(
         verdict.status == Status.RESISTANT.value, verdict.margin, jnp.minimum(verdict.margin, -1e-12)
     )
-    deficient = verdict.rank < grasp.dimension * (grasp.dimension + 1) // 2
+    deficient = (verdict.rank >= 0) & (verdict.rank < grasp.dimension * (grasp.dimension + 1) // 2)
     return jnp.where(deficient, -1.0, jnp.maximum(margin, -1.0))
 
 
@@ -211,4 +228,7 @@ def critical_friction(grasp: Grasp) -> CriticalFriction:
         raise ValueError(f"critical_friction takes a jaxgrasp.Grasp, got {type(grasp).__name__}")
     still = jax.tree.map(lax.stop_gradient, grasp)
     factor, lower, upper = _critical(_data(grasp), still.model, grasp.active)
-    return CriticalFriction(factor, lower, upper)
+    status = jnp.where(upper <= 1, Status.RESISTANT.value, Status.MARGINAL.value)
+    status = jnp.where(lower >= 1, Status.NOT_RESISTANT.value, status)
+    status = jnp.where(jnp.isnan(factor), Status.INVALID.value, status).astype(jnp.int32)
+    return CriticalFriction(status, factor, lower, upper)

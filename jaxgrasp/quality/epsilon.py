@@ -21,10 +21,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.core import Tracer
+from jax.typing import ArrayLike
 
 from ..backend import batched, in_chunks, map_tiles
+from ..certificates import check_epsilon, checked_by
 from ..contacts import Grasp
-from ..core import Array, Bool, Float, Int, Status
+from ..core import Answer, Array, Bool, Float, Int, Status
 from ..resistance import wrench_resistance
 from .polytope import Capacity, Polytope, begin, grow, widen
 from .unit_wrench_space import NORMS, effort_map, extreme_force, scaled, support, torque_lengths
@@ -36,7 +38,8 @@ CAPACITIES = (Capacity(1024, 64, 192, 256), Capacity(16384, 512, 2048, 2048))
 CHUNK = 64  # grasps an executable takes at once when called on concrete arrays
 
 
-class EpsilonQuality(eqx.Module):
+@checked_by(lambda grasp, answer, problem, tolerance: check_epsilon(grasp, answer, tolerance))
+class EpsilonQuality(Answer):
     """``lower <= epsilon <= upper``, in N of resisted wrench (torques over ``torque_scale``) per N of effort.
 
     status       int32, the ``Status`` of wrench resistance; both bounds are 0 unless RESISTANT, NaN where INVALID
@@ -66,6 +69,11 @@ class EpsilonQuality(eqx.Module):
     facets: Int[Array, "*batch F m"]
     torque_scale: Float[Array, "*batch"]
     norm: str = eqx.field(static=True)
+
+    def values(self, index: int | tuple[int, ...] = ()) -> str:
+        """The bracket of one lane in words."""
+        lower, upper = (np.asarray(x)[index] for x in (self.lower, self.upper))
+        return "" if np.isnan(lower) else f"Epsilon ({self.norm}) between {lower:.6g} and {upper:.6g}."
 
     @property
     def width(self) -> Float[Array, "*batch"]:
@@ -215,8 +223,9 @@ def _to_components(grasp: Grasp, s: Array) -> Array:
 
 def epsilon_quality(
     grasp: Grasp,
+    *,
     norm: str = "L1",
-    torque_scale: Any = None,
+    torque_scale: Float[ArrayLike, "*batch"] | None = None,
     tolerance: float = 0.01,
     certificate: bool = False,
 ) -> EpsilonQuality:
@@ -227,7 +236,7 @@ def epsilon_quality(
     torque_scale  m, a number or one a grasp: torques count as tau / torque_scale. By default the largest distance of a
                   contact from the centre of mass; give the object's radius to compare grasps of one object
     tolerance     ``lower >= (1 - tolerance) upper`` is the goal; the bounds hold wherever the search stops
-    certificate   keep the polytope that proves ``lower``, about 30 kB a grasp, for ``check_certificate``
+    certificate   keep the polytope that proves ``lower``, about 30 kB a grasp, for ``check``
 
     Both bounds have the same derivative, that of epsilon: exact where ``smooth``, one finite choice elsewhere; second
     derivatives do not exist here. Exact friction cones, all contact models.

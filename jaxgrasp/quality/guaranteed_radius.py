@@ -22,13 +22,13 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from ..contacts import Grasp, length_scale
-from ..core import Array, Float, Int, Status, normalize, safe_root
+from ..core import Answer, Array, Float, Int, Status, normalize, safe_root
 from ..resistance import wrench_resistance
 from .unit_wrench_space import effort_map, scaled
 
@@ -39,7 +39,7 @@ LARGEST = 0.5  # beyond it the chord bound is of no use
 TOLERANCE = 1e-12  # of the margin; forces and twists, and the derivative with them, are known to its root
 
 
-class GuaranteedRadius(eqx.Module):
+class GuaranteedRadius(Answer):
     """``radius``: no change within it changes ``status``.
 
     status  int32, the ``Status`` of wrench resistance
@@ -51,6 +51,11 @@ class GuaranteedRadius(eqx.Module):
     status: Int[Array, "*batch"]
     radius: Float[Array, "*batch"]
     length: Float[Array, "*batch"]
+
+    def values(self, index: int | tuple[int, ...] = ()) -> str:
+        """The radius of one lane in words."""
+        radius, length = (np.asarray(x)[index] for x in (self.radius, self.length))
+        return "" if np.isnan(radius) else f"Contacts may be off by {radius:.4g}, or {radius * length:.4g} m."
 
 
 class _Data(NamedTuple):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from ..contacts import Grasp, grasp_map
 from ..core import Array, Float, wrench_dimension
@@ -22,7 +23,9 @@ def _singular_values(grasp: Grasp, torque_scale: Any) -> Array:
     return jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)])
 
 
-def grasp_isotropy(grasp: Grasp, torque_scale: Any = None) -> Float[Array, "*batch"]:
+def grasp_isotropy(
+    grasp: Grasp, *, torque_scale: Float[ArrayLike, "*batch"] | None = None
+) -> Float[Array, "*batch"]:
     """``sigma_min / sigma_max`` of G, torques over ``torque_scale`` (m; by default L): 1 is best.
 
     Unit contact forces in all directions, pulling ones too: no friction cone. Source: Kim et al. 2001.
@@ -31,7 +34,9 @@ def grasp_isotropy(grasp: Grasp, torque_scale: Any = None) -> Float[Array, "*bat
     return values[..., -1] / values[..., 0]
 
 
-def grasp_volume(grasp: Grasp, torque_scale: Any = None) -> Float[Array, "*batch"]:
+def grasp_volume(
+    grasp: Grasp, *, torque_scale: Float[ArrayLike, "*batch"] | None = None
+) -> Float[Array, "*batch"]:
     """``sqrt(det(G G^T)) = product of the singular values`` of G, torques over ``torque_scale`` (m; by default L).
 
     Proportional to the volume of the ellipsoid of wrenches that unit contact forces reach. Source: Li, Sastry 1988.

@@ -10,35 +10,38 @@ that cannot squeeze may score well; they are here for comparison. Sources: Polla
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from ..contacts import Grasp
-from ..core import Array, Float, Int, Status
-from ..forces import ForceOptimum, Gentlest, SmallestSum, resistible_wrenches
+from ..core import Answer, Array, Float, Int, Status
+from ..forces import Gentlest, OptimalForces, SmallestSum, resistible_wrenches
 from .unit_wrench_space import NORMS
 
 __all__ = ["TaskQuality", "task_quality"]
 
 
-class TaskQuality(eqx.Module):
+class TaskQuality(Answer):
     """How well each grasp does a task of T wrenches; efforts in N.
 
+    status    (*batch) int32, a ``Status``: OPTIMAL where every wrench can be held, INFEASIBLE where one cannot, STALLED
+              where one is open, INVALID
     multiple  (*batch) the largest multiple of all task wrenches, and of their convex hull, that unit effort resists;
               1 / N. 0 where one of them cannot be resisted at all, NaN where INVALID
     effort    (*batch, T) the least effort that holds each wrench; infinite where none does
     worst     (*batch) int32, the wrench that takes most
-    optimum   the ``ForceOptimum`` of every wrench: forces, bounds, escape twists
+    forces    the ``OptimalForces`` of every wrench: forces, bounds, escape twists
     """
 
+    status: Int[Array, "*batch"]
     multiple: Float[Array, "*batch"]
     effort: Float[Array, "*batch T"]
     worst: Int[Array, "*batch"]
-    optimum: ForceOptimum
+    forces: OptimalForces
 
 
 def task_quality(
-    grasp: Grasp, wrenches: Float[Array, "*batch T m"], norm: str = "L1", tolerance: float = 1e-8
+    grasp: Grasp, wrenches: Float[ArrayLike, "*batch T m"], *, norm: str = "L1", tolerance: float = 1e-8
 ) -> TaskQuality:
     """``min_j 1 / min {effort(f) : G f + w_j = 0, f in C}``: a task's wrenches, and the one that decides.
 
@@ -51,12 +54,24 @@ def task_quality(
     if norm not in NORMS:
         raise ValueError(f"norm must be one of {', '.join(NORMS)}, got {norm!r}")
     criterion = SmallestSum() if norm == "L1" else Gentlest()
-    held = resistible_wrenches(grasp, wrenches, criterion, tolerance=tolerance)
-    status, cost = held.optimum.status, held.optimum.cost
+    held = resistible_wrenches(grasp, wrenches, criterion=criterion, tolerance=tolerance)
+    status, cost = held.status, held.forces.cost
     effort = jnp.where(status == Status.OPTIMAL.value, cost, jnp.inf)
     most = jnp.max(effort, axis=-1)
     multiple = jnp.where(jnp.isfinite(most) & (most > 0), 1 / jnp.where(most > 0, most, 1.0), 0.0)
     multiple = jnp.where(most == 0, jnp.inf, multiple)
     invalid = jnp.any(status == Status.INVALID.value, axis=-1)
     worst = jnp.argmax(effort, axis=-1).astype(jnp.int32)
-    return TaskQuality(jnp.where(invalid, jnp.nan, multiple), effort, worst, held.optimum)
+    multiple = jnp.where(invalid, jnp.nan, multiple)
+    return TaskQuality(_whole(status), multiple, effort, worst, held.forces)
+
+
+def _whole(status: Array) -> Array:
+    """The status of a task from those of its wrenches (*batch, T): the worst one says it."""
+
+    def some(value: Status) -> Array:
+        return jnp.any(status == value.value, axis=-1)
+
+    whole = jnp.where(some(Status.STALLED), Status.STALLED.value, Status.OPTIMAL.value)
+    whole = jnp.where(some(Status.INFEASIBLE), Status.INFEASIBLE.value, whole)
+    return jnp.where(some(Status.INVALID), Status.INVALID.value, whole).astype(jnp.int32)

@@ -11,10 +11,9 @@ every contact is the unit cone, so h_i = v_0 + |v_t| with v = A_i^T d; no cone i
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax.numpy as jnp
 from jax import lax
+from jax.typing import ArrayLike
 
 from ..contacts import Grasp, folded_grasp_map, length_scale
 from ..core import Array, Float, safe_root, wrench_dimension
@@ -33,7 +32,9 @@ __all__ = [
 NORMS = ("L1", "Linf")
 
 
-def torque_lengths(grasp: Grasp, torque_scale: Any = None) -> Float[Array, "*batch"]:
+def torque_lengths(
+    grasp: Grasp, torque_scale: Float[ArrayLike, "*batch"] | None = None
+) -> Float[Array, "*batch"]:
     """The length torques are divided by, m: as given, or L, the largest distance of a contact from the centre.
 
     It stands for the object's radius: derivatives hold it fixed.

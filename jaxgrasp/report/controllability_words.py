@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from ..core import Status
-from ..motion import Controllability, ControllabilityVerdict, OperatingPoint
+from ..motion import Controllability, Linearization
 from .words import screw, vector
 
 __all__ = ["explain_controllability", "motion_words"]
 
-V = ControllabilityVerdict
+V = Status
 
 
 def motion_words(twist: np.ndarray, centre_of_mass: np.ndarray, size: float) -> str:
@@ -49,12 +49,12 @@ def explain_controllability(
     def at(name: str) -> np.ndarray:
         return np.asarray(getattr(found, name))[lane]
 
-    verdict, point = V(int(at("verdict"))), OperatingPoint(int(at("point")))
-    lines = [verdict.sentence]
+    verdict, point = V(int(at("status"))), V(int(at("equilibrium")))
+    lines = [found.sentence(lane)]
     if verdict is V.INVALID:
         return lines[0]
     if verdict in (V.NO_EQUILIBRIUM, V.MARGINAL, V.UNDECIDED):
-        lines.append(point.sentence)
+        lines.append(Linearization.SENTENCES.get(point, point.sentence))
     rank, reduced, alone = (int(at(name)) for name in ("rank", "reduced_rank", "grasp_rank"))
     lines.append(
         f"The fingers alone reach {alone} of {m} directions, with gravity {reduced}; the controllability matrix has "
@@ -71,6 +71,6 @@ def explain_controllability(
             f"The state hardest to reach takes {float(at('effort')):.3g} times the weight, root mean square of all "
             "contact forces in units of their friction cones, for one radius of gyration in the time sqrt(l / g)."
         )
-    if verdict is V.CONTROLLABLE and Status(int(at("status"))) is Status.MARGINAL:
+    if verdict is V.CONTROLLABLE and V(int(at("resistance"))) is V.MARGINAL:
         lines.append("Its margin of wrench resistance is zero.")
     return "\n".join(lines)

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..backend import precision
-from ..certificates import check_certificate
+from ..certificates import check
 from ..contacts import MODELS, Component, Grasp, grasp_map
 from ..core import Status, UserError
-from ..forces import CRITERIA, ForceOptimum, closeness, make_criterion
+from ..forces import CRITERIA, OptimalForces, closeness, make_criterion
 from .words import screw
 
 __all__ = ["ForceAnswer", "contact_rows", "cost_words", "infeasible_words", "load_words", "reprove_forces"]
@@ -238,22 +238,27 @@ def reprove_forces(answer: ForceAnswer) -> bool:
         nothing = jnp.zeros(m)
         said = {name: answer.criterion[name] for name in ("weight", "length")}
         criterion = make_criterion(answer.criterion["name"], **said)
-        found = ForceOptimum(
+        found = OptimalForces(
             status=jnp.int32(int(answer.status)),
             force=jnp.zeros(k * len(answer.components))
             if answer.force is None
             else jnp.asarray(answer.force).ravel(),
-            cost=jnp.asarray(answer.cost),
-            bound=jnp.asarray(answer.bound),
+            upper=jnp.asarray(answer.cost),
+            lower=jnp.asarray(answer.bound),
             escape_twist=nothing if answer.escape_twist is None else jnp.asarray(answer.escape_twist),
             load_twist=nothing if answer.load_twist is None else jnp.asarray(answer.load_twist),
             joint_rates=jnp.zeros(0),
             smooth=jnp.asarray(False),  # not stored, and no part of the proof
             iterations=jnp.int32(0),
             stop=jnp.int32(0),
-            wrench=jnp.asarray(answer.wrench),
-            criterion=criterion,
-            max_normal=None if answer.max_normal is None else jnp.full(k, answer.max_normal),
-            torque_limits=None,
         )
-        return bool(check_certificate(grasp, found, closeness(answer.tolerance)))
+        return bool(
+            check(
+                grasp,
+                found,
+                wrench=answer.wrench,
+                criterion=criterion,
+                max_normal=answer.max_normal,
+                tolerance=closeness(answer.tolerance),
+            )
+        )

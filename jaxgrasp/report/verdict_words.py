@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..backend import precision
-from ..certificates import check_certificate
+from ..certificates import check_resistance
 from ..contacts import MODELS, Grasp
 from ..core import Status, UserError
 from .words import Screw, screw, vector
@@ -209,7 +209,7 @@ def reprove_verdict(verdict: Verdict, metadata: dict[str, Any]) -> str:
             internal_force=force,
             escape_twist=np.resize(zero, 6) if verdict.twist is None else verdict.twist,
         )
-        proved = bool(check_certificate(grasp, evidence, metadata.get("tolerance", 1e-8)))
+        proved = bool(check_resistance(grasp, evidence, tolerance=metadata.get("tolerance", 1e-8)))
     if verdict.status in (Status.UNDECIDED, Status.INVALID):
         return (
             "There is nothing to prove."

@@ -28,7 +28,6 @@ from ..conic import (
     ConvexProgram,
     Point,
     Shift,
-    Stop,
     centring,
     cone_sum,
     lagrangian,
@@ -48,7 +47,7 @@ from ..contacts import (
     unfold,
     zero_tangent,
 )
-from ..core import Array
+from ..core import Array, Status
 from .problem import margin_program
 from .verdict import Verdict
 
@@ -149,7 +148,7 @@ def _tangents(form: _Form, result: Solved, contacts: Contacts, change: Any) -> S
 
     assert result.point is not None and result.scales is not None
     data, changes = jax.tree.map(flat, (contacts, change))
-    ok = jnp.isfinite(flat(result.verdict.margin)) & (flat(result.stop) != Stop.SKIPPED.value)
+    ok = jnp.isfinite(flat(result.verdict.margin)) & (flat(result.stop) != Status.SKIPPED.value)
     data, changes = safe_contacts(ok, data), jax.tree.map(lambda x, dx: masked(ok, x, dx), data, changes)
     y, u, z = (flat(x) for x in result.point)  # (N, m), (N, d, k), (N, d, k)
     apex = jnp.zeros(u.shape[1:2], u.dtype).at[0].set(1.0)[:, None]

@@ -9,21 +9,21 @@ then the stragglers, then the answers; grasps of doubtful rank get their singula
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.core import Tracer
 
 from ..backend import batched, in_chunks, kernel, map_selected, map_tiles, tile_width, to_lanes, to_rows
+from ..certificates import check_resistance, checked_by
 from ..conic import (
     ConeProgram,
     Iterate,
     Progress,
-    Stop,
     begin_cone_program,
     cone_max,
     cone_sum,
@@ -32,9 +32,11 @@ from ..conic import (
 )
 from ..contacts import Component, Contacts, Folded, Grasp, contacts_of, fold, project, to_twist
 from ..core import (
+    Answer,
     Array,
     Float,
     Int,
+    Status,
     gap_floor,
     rank_tolerance,
     rounding_constant,
@@ -53,29 +55,53 @@ TOTAL_BUDGET = 60
 CHUNK = 4096  # grasps an executable takes at once when called on concrete arrays
 
 
-class WrenchResistance(eqx.Module):
+@checked_by(lambda grasp, answer, problem, tolerance: check_resistance(grasp, answer, tolerance))
+class WrenchResistance(Answer):
     """Verdicts and their proofs, with the batch axes of the grasp in front.
 
-    status          int32, a ``Status``
-    margin, gap     the true margin t* lies in [margin, margin + gap]; t* <= 1, no unit; -inf where no internal
-                    force has a normal component; NaN where INVALID
-    rank            of the folded grasp map, as a float so that INVALID can be NaN
-    internal_force  (*batch, k n) in the chapter's component order, mean normal force 1: the forces behind ``margin``
-                    and the proof of RESISTANT; zero where margin is -inf, NaN where INVALID
+    status          int32, a ``Status``: RESISTANT, NOT_RESISTANT, MARGINAL, UNDECIDED or INVALID
+    lower, upper    the true margin t* lies between them; t* <= 1, no unit; -inf where no internal force has a normal
+                    component; NaN where INVALID
+    rank            int32, of the folded grasp map; -1 where INVALID
+    internal_force  (*batch, k n) in the chapter's component order, mean normal force 1: the forces behind ``lower``
+                    and the proof of RESISTANT; zero where the margin is -inf, NaN where INVALID
     escape_twist    (*batch, m) (velocity; angular velocity), unit norm: the proof of NOT_RESISTANT; zero
                     where RESISTANT
     iterations      int32 interior-point iterations spent
-    stop            int32, a ``solver.Stop``: why the iteration ended; ``Stop(code).sentence`` says it in words
+    stop            int32, a ``Status``: why the iteration ended
     """
 
     status: Int[Array, "*batch"]
-    margin: Float[Array, "*batch"]
-    gap: Float[Array, "*batch"]
-    rank: Float[Array, "*batch"]
+    lower: Float[Array, "*batch"]
+    upper: Float[Array, "*batch"]
+    rank: Int[Array, "*batch"]
     internal_force: Float[Array, "*batch kn"]
     escape_twist: Float[Array, "*batch m"]
     iterations: Int[Array, "*batch"]
     stop: Int[Array, "*batch"]
+
+    SENTENCES: ClassVar[Mapping[Status, str]] = {
+        Status.MARGINAL: "Marginal: the margin is zero to within the tolerance, so any disturbance may break the "
+        "grasp.",
+        Status.INVALID: "Invalid: the numbers are not a grasp (NaN or infinite entry, zero-length normal, negative "
+        "friction, or no active contact).",
+    }
+
+    @property
+    def margin(self) -> Float[Array, "*batch"]:
+        """t* as far as it is proven: ``lower``. Its gradient is that of t*."""
+        return self.lower
+
+    @property
+    def gap(self) -> Float[Array, "*batch"]:
+        """``upper - lower``: how far t* may be above ``margin``; 0 where both are infinite."""
+        same = self.lower == self.upper
+        return jnp.where(same, jnp.zeros_like(self.lower), self.upper - self.lower)
+
+    def values(self, index: int | tuple[int, ...] = ()) -> str:
+        """Margin and rank of one lane in words."""
+        lower, upper, rank = (np.asarray(x)[index] for x in (self.lower, self.upper, self.rank))
+        return "" if np.isnan(lower) else f"Margin between {lower:.6g} and {upper:.6g}, rank {rank}."
 
 
 class _State(NamedTuple):
@@ -153,8 +179,8 @@ def _setup_kernel(plan: _Plan) -> Callable[[Contacts], _Setup]:
         state = begin_cone_program(program, start.iterate._replace(y=dual), ~folded.valid | refuted)
         if plan.verdict_only:
             proven = start.lower > _room_for_rounding(folded, projection.sigma)
-            stop = jnp.where(proven, jnp.int32(Stop.DECIDED.value), state.stop)
-            state = state._replace(stop=jnp.where(state.stop == Stop.RUNNING.value, stop, state.stop))
+            stop = jnp.where(proven, jnp.int32(Status.DECIDED.value), state.stop)
+            state = state._replace(stop=jnp.where(state.stop == Status.RUNNING.value, stop, state.stop))
         return _Setup(_State.pack(state), projection.sigma, start.unbounded)
 
     return run
@@ -243,7 +269,7 @@ def _solve_rows(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array)
 
     def one_round(i: Array, state: _State) -> _State:
         # A rank-deficient grasp has its verdict; only its margin is left to find.
-        unfinished = exists & (state.stop == Stop.RUNNING.value)
+        unfinished = exists & (state.stop == Status.RUNNING.value)
         if plan.verdict_only:
             unfinished = unfinished & full_rank
         budget = budgets[i]
@@ -259,6 +285,21 @@ def _solve_rows(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array)
     return Solved(read.verdict, state.iterations, state.stop, point, read.scales)
 
 
+def _answer(solved: Solved) -> WrenchResistance:
+    found = solved.verdict
+    rank = jnp.where(jnp.isnan(found.rank), -1, found.rank).astype(jnp.int32)
+    return WrenchResistance(
+        found.status,
+        found.margin,
+        found.margin + found.gap,
+        rank,
+        found.internal_force,
+        found.escape_twist,
+        solved.iterations,
+        solved.stop,
+    )
+
+
 @functools.cache
 def _compiled(plan: _Plan) -> Callable[..., WrenchResistance]:
     solve = batched(functools.partial(_solve_rows, plan), lambda rows: rows.active.shape[:-1], plan.width)
@@ -266,15 +307,14 @@ def _compiled(plan: _Plan) -> Callable[..., WrenchResistance]:
 
     def result(contacts: Contacts, tolerance: Array) -> WrenchResistance:
         solved = run(contacts, tolerance)
-        return WrenchResistance(*solved.verdict, iterations=solved.iterations, stop=solved.stop)
+        return _answer(solved)
 
     return jax.jit(result)
 
 
 @functools.partial(jax.jit, static_argnames=("plan",))
 def _solve_chunk(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array) -> WrenchResistance:
-    solved = _solve_rows(plan, contacts, count, tolerance)
-    return WrenchResistance(*solved.verdict, iterations=solved.iterations, stop=solved.stop)
+    return _answer(_solve_rows(plan, contacts, count, tolerance))
 
 
 def _solve_on_host(plan: _Plan, contacts: Contacts, tolerance: Array) -> WrenchResistance:
@@ -284,7 +324,9 @@ def _solve_on_host(plan: _Plan, contacts: Contacts, tolerance: Array) -> WrenchR
     return in_chunks(solve, contacts, contacts.active.shape[:-1], CHUNK)
 
 
-def wrench_resistance(grasp: Grasp, tolerance: float = 1e-8, verdict_only: bool = False) -> WrenchResistance:
+def wrench_resistance(
+    grasp: Grasp, *, tolerance: float = 1e-8, verdict_only: bool = False
+) -> WrenchResistance:
     """Wrench resistance (force closure) of a batch of grasps, with margin and proof (Theorem 1, Prop. 11.2.2).
 
         t* = max t   subject to   G f = 0,   f_n,i - psi_i(f_i) >= t for all i,   sum_i f_n,i = k
@@ -292,7 +334,7 @@ def wrench_resistance(grasp: Grasp, tolerance: float = 1e-8, verdict_only: bool 
     A grasp is resistant iff its folded grasp map has rank m and t* > 0.
 
     grasp         a ``Grasp`` with any batch axes; works under ``jax.jit`` and ``jax.vmap``
-    tolerance     width of the bracket [margin, margin + gap] to reach, relative to max(1, |t*|); float32 usually
+    tolerance     width of the bracket [lower, upper] to reach, relative to max(1, |t*|); float32 usually
                   closes it to about 1e-3. Enable 64-bit JAX (``jax_enable_x64``) for float64.
     verdict_only  stop each grasp as soon as a certificate exists: faster, with a wider bracket
 

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..conic import Progress, Step, Stop, advance, begin_cone_program
+from ..conic import Progress, Step, advance, begin_cone_program
 from ..contacts import Component, Contacts, Grasp, contacts_of, fold, project
-from ..core import Array, Float, gap_floor
+from ..core import Array, Float, Status, gap_floor
 from .problem import margin_program, starting_point
 from .solve import TOTAL_BUDGET
 
@@ -24,7 +24,7 @@ class Trace(eqx.Module):
     residual         (n + 1,) |b - B u| before each step (NaN at the start, as the two below)
     centering        (n + 1,) Mehrotra's sigma
     length           (n + 1,) step length
-    stop             why it ended, a ``solver.Stop`` number
+    stop             why it ended, a ``Status`` number
     """
 
     lower: Float[Array, " steps"]
@@ -43,7 +43,7 @@ class Trace(eqx.Module):
                 row += f"  {self.residual[i]:9.1e}  {self.centering[i]:8.1e}"
                 row += f"  {self.length[i]:6.4f}"
             lines.append(row)
-        lines.append(Stop(self.stop).sentence)
+        lines.append(Status(self.stop).sentence)
         return "\n".join(lines)
 
 
@@ -86,7 +86,7 @@ def trace(grasp: Grasp, tolerance: float = 1e-8, max_iterations: int = TOTAL_BUD
     state = first(rows)
     nan = float("nan")
     log = [[*(float(x[0]) for x in values(rows, state)), float(state.gap[0]), nan, nan, nan]]
-    while int(state.stop[0]) == Stop.RUNNING and len(log) <= max_iterations:
+    while int(state.stop[0]) == Status.RUNNING and len(log) <= max_iterations:
         state, info = step(rows, state)
         bounds = (float(x[0]) for x in values(rows, state))
         log.append([*bounds, float(state.gap[0]), *(float(x[0]) for x in info)])

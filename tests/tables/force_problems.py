@@ -35,7 +35,7 @@ def problems(name, limits, count, seed):
     n, m = len(components), 3 if dimension == 2 else 6
     wrench = rng.normal(size=(count, m))
     kind = rng.integers(4, size=count)
-    G = np.asarray(jg.folded_grasp_map(probe)).reshape(count, m, K, n)
+    G = np.asarray(jg.contacts.folded_grasp_map(probe)).reshape(count, m, K, n)
     head = components.index("f_n")
     s = rng.normal(size=(count, K, n))
     tails = np.delete(s, head, -1)

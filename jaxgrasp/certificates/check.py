@@ -1,0 +1,146 @@
+"""One way to ask for a proof: ``check(grasp, answer, ..)`` proves the caller's problem with the answer's evidence.
+
+Numpy only, and nothing else of this library: a bug elsewhere cannot make a wrong proof look right. Which checker an
+answer needs is registered for its class where the class is defined.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import singledispatch
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from .rebuilt import component_vectors
+
+__all__ = ["check", "checked_by", "force_claim"]
+
+
+@singledispatch
+def _checker(answer: Any) -> Callable[..., np.ndarray]:
+    raise ValueError(
+        f"a {type(answer).__name__} carries no certificate; check takes the answers of wrench_resistance, "
+        "optimize_forces and epsilon_quality"
+    )
+
+
+def checked_by(checker: Callable[..., np.ndarray]) -> Callable[[type], type]:
+    """Class decorator: ``checker(grasp, answer, problem, tolerance)`` proves answers of this class."""
+
+    def register(kind: type) -> type:
+        _checker.register(kind, lambda answer: checker)
+        return kind
+
+    return register
+
+
+def check(
+    grasp,
+    answer,
+    *,
+    wrench=None,
+    criterion=None,
+    max_normal=None,
+    torque_limits=None,
+    tolerance: float | None = None,
+) -> np.ndarray:
+    """Whether the evidence in ``answer`` proves it, lane by lane: numpy bool, the shape of ``answer.status``.
+
+    grasp          a ``Grasp``
+    answer         what ``wrench_resistance(grasp)``, ``optimize_forces(grasp, wrench, ..)`` or
+                   ``epsilon_quality(grasp, certificate=True)`` returned
+    wrench, criterion, max_normal, torque_limits
+                   for forces: the problem, exactly as ``optimize_forces`` was asked; wrench and criterion are required.
+                   What is proved is this problem, whatever the answer was made for
+    tolerance      for verdicts: the |t*| that MARGINAL may claim; by default what the answer's own bracket claims, as
+                   long as that is below 1e-3. For forces: the relative gap that OPTIMAL may leave, by default 1e-6.
+                   For epsilon: the rounding its bounds may show, by default 1e-9 of epsilon
+
+    Runs on the host in float64 whatever the dtype of the grasp; a few operations a lane. What is asked of each status
+    is written in ``certificates/resistance.py``, ``certificates/forces.py`` and ``certificates/epsilon.py``.
+    ValueError for an answer without a certificate, for forces without wrench and criterion, and for a problem of
+    another shape.
+    """
+    problem = SimpleNamespace(
+        wrench=wrench, criterion=criterion, max_normal=max_normal, torque_limits=torque_limits
+    )
+    return _checker(answer)(grasp, answer, problem, tolerance)
+
+
+def _spread(
+    value, own: tuple[int, ...], batch: tuple[int, ...], shape: tuple[int, ...], name: str
+) -> np.ndarray:
+    """``value`` with trailing axes ``own``, one for all, one a grasp or one a problem, spread over all problems."""
+    array = np.asarray(value, np.float64)
+    lead = array.shape[: array.ndim - len(own)]
+    if array.shape[array.ndim - len(own) :] == own:
+        loads = len(shape) - len(batch)
+        if len(lead) <= len(batch) and loads:
+            array = array.reshape(*lead, *([1] * loads), *own)
+        try:
+            return np.broadcast_to(array, (*shape, *own))
+        except ValueError:
+            pass
+    raise ValueError(f"{name} of shape {np.shape(value)} does not fit problems of shape {(*shape, *own)}")
+
+
+def _in_contact_axes(grasp, torque_limits) -> tuple[Any, Any]:
+    """(J, tau_max) for forces in contact axes; J in body or world axes is turned here, ``J_contact = B^T J``."""
+    axes = getattr(torque_limits, "axes", None)
+    if axes is None:
+        return torque_limits
+    jacobian, torque = np.asarray(torque_limits.jacobian, np.float64), torque_limits.torque
+    if axes == "contact":
+        return jacobian, torque
+    B = component_vectors(grasp, torque_limits.orientation if axes == "world" else None)
+    k, r, n = B.shape[-3:]
+    rows = jacobian.reshape(*jacobian.shape[:-2], k, r, jacobian.shape[-1])
+    turned = np.einsum("...krn,...krq->...knq", B, rows)
+    return turned.reshape(*turned.shape[:-3], k * n, turned.shape[-1]), torque
+
+
+def force_claim(grasp, answer, problem) -> SimpleNamespace:
+    """The forces of an answer beside the caller's problem, spread over all lanes: what ``check_forces`` reads."""
+    if problem.wrench is None or problem.criterion is None:
+        raise ValueError(
+            "forces are checked against the problem they answer: give wrench=.. and criterion=.., and max_normal=.., "
+            "torque_limits=.. where there were any"
+        )
+    shape, batch = np.shape(answer.status), grasp.position.shape[:-2]
+    k, m = grasp.position.shape[-2], 3 if grasp.position.shape[-1] == 2 else 6
+    wrench = _spread(problem.wrench, (m,), batch, shape, "wrench")
+    cap = limits = None
+    if problem.max_normal is not None:
+        value = np.asarray(problem.max_normal, np.float64)
+        cap = _spread(np.broadcast_to(value, (*value.shape[:-1], k)), (k,), batch, shape, "max_normal")
+    if problem.torque_limits is not None:
+        jacobian, torque = _in_contact_axes(grasp, problem.torque_limits)
+        rows, joints = np.shape(jacobian)[-2:]
+        torque = np.broadcast_to(torque, (*np.shape(torque)[:-1], joints))
+        limits = (
+            _spread(jacobian, (rows, joints), batch, shape, "J"),
+            _spread(torque, (joints,), batch, shape, "tau_max"),
+        )
+    criterion = problem.criterion
+    name = type(criterion).__name__
+    weights = {
+        key: _spread(getattr(criterion, key), (), batch, shape, f"the criterion's {key}")
+        for key in ("weight", "length")
+        if getattr(criterion, key, None) is not None
+    }
+    return SimpleNamespace(
+        status=answer.status,
+        force=answer.force,
+        cost=answer.upper,
+        bound=answer.lower,
+        escape_twist=answer.escape_twist,
+        load_twist=answer.load_twist,
+        joint_rates=answer.joint_rates,
+        smoothing=answer.smoothing,
+        wrench=wrench,
+        criterion=type(name, (), weights)(),
+        max_normal=cap,
+        torque_limits=limits,
+    )

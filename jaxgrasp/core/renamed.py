@@ -1,0 +1,92 @@
+"""Where names of version 0.1 went, for the message of an AttributeError."""
+
+from __future__ import annotations
+
+__all__ = ["renamed"]
+
+# Old name at the top of the package -> where it is now. CHANGELOG.md has the same table with fields and arguments.
+_NEW_PLACES = {
+    "ContactModel": "contacts.ContactModel",
+    "folded_grasp_map": "contacts.folded_grasp_map",
+    "grasp_singular_values": "contacts.grasp_singular_values",
+    "internal_force_part": "contacts.internal_force_part",
+    "friction_lmi": "lmi.friction_lmi",
+    "FrictionLMI": "lmi.FrictionLMI",
+    "margin_lmi": "lmi.margin_lmi",
+    "lmi_margin": "lmi.lmi_margin",
+    "lmi_minimize": "lmi.lmi_minimize",
+    "lmi_feasibility": "lmi.lmi_feasibility",
+    "sdp_minimize": "lmi.sdp_minimize",
+    "second_order_cone_lmi": "lmi.second_order_cone_lmi",
+    "LMIProblem": "lmi.LMIProblem",
+    "LogDetTerm": "lmi.LogDetTerm",
+    "LMISolution": "lmi.LMISolution",
+    "LMIFeasibility": "lmi.LMIFeasibility",
+    "SDPSolution": "lmi.SDPSolution",
+    "lmi_forces": "lmi.lmi_forces",
+    "LMIForces": "lmi.LMIForces",
+    "Stop": "Status",
+    "Trace": "resistance.Trace",
+    "ForceOptimum": "OptimalForces",
+    "Criterion": "forces.Criterion",
+    "Equilibrium": "forces.Equilibrium",
+    "EquilibriumKind": "Status",
+    "Squeeze": "forces.Squeeze",
+    "ResistibleWrenches": "forces.ResistibleWrenches",
+    "EpsilonQuality": "quality.EpsilonQuality",
+    "CriticalFriction": "quality.CriticalFriction",
+    "friction_sweep": "quality.friction_sweep",
+    "with_friction_factor": "quality.with_friction_factor",
+    "GuaranteedRadius": "quality.GuaranteedRadius",
+    "TaskQuality": "quality.TaskQuality",
+    "grasp_isotropy": "quality.grasp_isotropy",
+    "grasp_volume": "quality.grasp_volume",
+    "mass_matrix": "motion.mass_matrix",
+    "coriolis": "motion.coriolis",
+    "gravity_term": "motion.gravity_term",
+    "world_grasp_map": "motion.world_grasp_map",
+    "acceleration": "motion.acceleration",
+    "advance": "motion.advance",
+    "Linearization": "motion.Linearization",
+    "OperatingPoint": "Status",
+    "Controllability": "motion.Controllability",
+    "ControllabilityVerdict": "Status",
+    "explain_controllability": "report.explain_controllability",
+    "controllability_matrix": "motion.controllability_matrix",
+    "gramian": "motion.gramian",
+    "mujoco_plant": "motion.mujoco_plant",
+    "mujoco_model": "motion.mujoco_model",
+    "MujocoPlant": "motion.MujocoPlant",
+    "ClosedLoop": "motion.ClosedLoop",
+    "Regulator": "motion.Regulator",
+    "Reference": "motion.Reference",
+    "ControlStatus": "Status",
+    "check_certificate": "check",
+    # Modules.
+    "certificate": "certificates",
+    "solver": "conic",
+    "requirements": "placement",
+    "objectives": "placement",
+    "meshes": "objects",
+    "candidates": "objects",
+    "raycast": "objects",
+    "screening": "jobs",
+    "tracing": "resistance",
+    "margin": "resistance",
+    "dynamics": "motion",
+    "simulation": "motion",
+    "control": "motion",
+    "criteria": "forces",
+    "errors": "core",
+    "status": "core",
+    "cones": "conic",
+    "grasp": "contacts",
+    "epsilon": "quality",
+}
+
+
+def renamed(name: str) -> str:
+    """The message for a name that the package does not have: where it went, or that there is none."""
+    if name in _NEW_PLACES:
+        return f"jaxgrasp.{name} is now jaxgrasp.{_NEW_PLACES[name]}"
+    return f"module 'jaxgrasp' has no attribute {name!r}"

@@ -1,0 +1,97 @@
+"""What is asked of each grasp, spread over all problems: loads, limits and weights that fit one, some or all of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from ..contacts import Contacts, Grasp, TorqueLimits, contacts_of
+from ..core import Array, real_array, wrench_dimension
+from .criteria import Criterion
+from .problem import Demand
+
+__all__ = ["demand_rows", "spread_loads"]
+
+
+def spread_loads(grasp: Grasp, wrench: Any) -> tuple[Array, tuple[int, ...]]:
+    """The wrench with all batch axes, and those axes: the grasp's, then any load axes."""
+    m, batch = wrench_dimension(grasp.dimension), grasp.batch_shape
+    array = real_array(wrench, "wrench").astype(grasp.dtype)
+    if array.ndim < 1 or array.shape[-1] != m:
+        raise ValueError(
+            f"wrench must have shape (*batch, *loads, {m}): (force; torque about the centre of mass), got {array.shape}"
+        )
+    lead = array.shape[:-1]
+    if not lead:
+        return jnp.broadcast_to(array, (*batch, m)), batch
+    if len(lead) < len(batch) or any(a not in (1, b) for a, b in zip(lead, batch, strict=False)):
+        raise ValueError(
+            f"the leading axes of wrench {array.shape} must start with the grasp's batch axes {batch} "
+            "(further axes are several loads for each grasp)"
+        )
+    shape = (*batch, *lead[len(batch) :])
+    return jnp.broadcast_to(array, (*shape, m)), shape
+
+
+def _spread(
+    value: Array, own: tuple[int, ...], batch: tuple[int, ...], shape: tuple[int, ...], name: str
+) -> Array:
+    """``value`` with trailing axes ``own`` broadcast over ``batch``, then over the load axes."""
+    loads = len(shape) - len(batch)
+    try:
+        full = jnp.broadcast_to(value, (*batch, *own))
+    except ValueError as error:
+        raise ValueError(f"{name} must broadcast to shape {(*batch, *own)}, got {value.shape}") from error
+    return jnp.broadcast_to(full.reshape(*batch, *([1] * loads), *own), (*shape, *own))
+
+
+def _weight(value: Array, batch: tuple[int, ...], shape: tuple[int, ...]) -> Array:
+    """One per problem: from one for all, one per grasp, or one per load."""
+    if value.ndim == len(shape) > len(batch):
+        return jnp.broadcast_to(value, shape)
+    return _spread(value, (), batch, shape, "the criterion's weight")
+
+
+def demand_rows(
+    grasp: Grasp,
+    wrench: Array,
+    shape: tuple[int, ...],
+    criterion: Criterion,
+    max_normal: Any,
+    torque_limits: Any,
+) -> tuple[Contacts, Demand]:
+    batch, k, dtype = grasp.batch_shape, grasp.contacts, grasp.dtype
+    n = grasp.model.force_size(grasp.dimension)
+    contacts = contacts_of(grasp)
+    spread = Contacts(*(_spread(x, x.shape[len(batch) :], batch, shape, "grasp") for x in contacts))
+    criterion = jax.tree.map(lambda x: _weight(x.astype(dtype), batch, shape), criterion)
+    log_det = None
+    if criterion.barrier_weight is not None:
+        terms = grasp.model.log_det_terms(grasp.dimension)
+        a, b, c = (_spread(x.astype(dtype), (k,), batch, shape, "grasp") for x in terms)
+        log_det = (a, b, c)
+    cap = None
+    if max_normal is not None:
+        cap = _spread(real_array(max_normal, "max_normal").astype(dtype), (k,), batch, shape, "max_normal")
+    jacobian = torque = None
+    if isinstance(torque_limits, TorqueLimits):
+        torque_limits = torque_limits.in_contact_axes(grasp)
+    if torque_limits is not None:
+        try:
+            jacobian, torque = torque_limits
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"torque_limits must be a pair (J, tau_max): J of shape (*batch, {k * n}, q) and tau_max (q)"
+            ) from error
+        jacobian = real_array(jacobian, "the hand Jacobian J").astype(dtype)
+        if jacobian.ndim < 2 or jacobian.shape[-2] != k * n:
+            raise ValueError(
+                f"the hand Jacobian J must have shape (*batch, {k * n}, q): one row for each force component "
+                f"({k} contacts of {n}), one column for each joint, got {jacobian.shape}"
+            )
+        joints = jacobian.shape[-1]
+        jacobian = _spread(jacobian, (k * n, joints), batch, shape, "the hand Jacobian J")
+        torque = _spread(real_array(torque, "tau_max").astype(dtype), (joints,), batch, shape, "tau_max")
+    return spread, Demand(wrench, criterion, log_det, cap, jacobian, torque)
