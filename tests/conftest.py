@@ -29,6 +29,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 import jax  # noqa: E402 - it reads the environment
+from interfaces import INTERFACES  # noqa: E402
 
 DTYPE = os.environ.get("JAXGRASP_TEST_DTYPE", "float64")
 if DTYPE not in ("float32", "float64"):
@@ -63,6 +64,23 @@ def pytest_unconfigure(config):
     shutil.rmtree(os.environ["XDG_CACHE_HOME"], ignore_errors=True)
     if Path(os.environ["JAX_COMPILATION_CACHE_DIR"]) == STORE:
         trim(STORE, STORE_BYTES)
+
+
+COLLECTED = pytest.StashKey[list[pytest.Item]]()  # before anything is deselected; for test_suite.py
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config, items):
+    config.stash[COLLECTED] = list(items)
+    for item in items:
+        if item.path.stem in INTERFACES:
+            item.add_marker(pytest.mark.interface)
+
+
+@pytest.fixture(scope="session")
+def collected(request):
+    """Every test that was found, those that this run leaves out included."""
+    return request.config.stash[COLLECTED]
 
 
 @pytest.fixture(scope="session")
