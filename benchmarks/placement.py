@@ -72,7 +72,7 @@ def real_meshes() -> list[str]:
 
 def surface_of(name: str) -> MeshSurface:
     source, _, unit = name.partition(":")
-    return surfaces.of(source, unit or "m")
+    return surfaces.of(source, unit=unit or "m")
 
 
 class Problem(NamedTuple):
@@ -173,7 +173,14 @@ def row(name: str, problem: Problem, starts: int, simplexes: int) -> dict[str, A
     objective = Epsilon("L1", problem.radius)
 
     def place() -> Placement:
-        return place_contacts(problem.surface, problem.fingers, problem.model, objective, starts, seed=1)
+        return place_contacts(
+            problem.surface,
+            fingers=problem.fingers,
+            model=problem.model,
+            objective=objective,
+            starts=starts,
+            seed=1,
+        )
 
     place()  # compiles
     begin = time.perf_counter()
@@ -244,10 +251,10 @@ def costs() -> list[dict[str, Any]]:
         problem = Problem(surface, fingers, model)
         for objective in (Margin(), Epsilon("L1", problem.radius), Epsilon("Linf", problem.radius)):
             first = time.perf_counter()
-            place_contacts(surface, fingers, model, objective, 64)
+            place_contacts(surface, fingers=fingers, model=model, objective=objective, starts=64)
             first = time.perf_counter() - first
             begin = time.perf_counter()
-            out = place_contacts(surface, fingers, model, objective, 256)
+            out = place_contacts(surface, fingers=fingers, model=model, objective=objective, starts=256)
             seconds = time.perf_counter() - begin
             name = f"{type(objective).__name__} {getattr(objective, 'norm', '')}".strip()
             rows.append({

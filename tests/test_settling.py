@@ -18,7 +18,7 @@ TARGET = np.array([[0.06, 0.0, 0.0], [0.0, 0.06, 0.0]])
 
 def coarse(subdivisions=1, resolution=32):
     """A ball of 5 cm out of few triangles: a facet's normal is up to 20 degrees off the ball's."""
-    return surfaces.MeshSurface(trimesh.creation.icosphere(subdivisions, radius=0.05), resolution)
+    return surfaces.MeshSurface(trimesh.creation.icosphere(subdivisions, radius=0.05), resolution=resolution)
 
 
 def near_targets(grasp):

@@ -181,7 +181,7 @@ def writable(output: Path, option: str = "-o") -> None:
 
 def prepare_load(request: LoadRequest) -> LoadRun:
     """Check the request and open its source. UserError: one line saying what to do."""
-    criterion = make_criterion(request.criterion, request.weight, request.length)
+    criterion = make_criterion(request.criterion, weight=request.weight, length=request.length)
     status = _status(request.status)
     positive_option("tolerance", request.tolerance)
     positive_option("max-normal", request.max_normal)

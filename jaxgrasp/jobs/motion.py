@@ -122,7 +122,7 @@ def prepare_check(request: CheckRequest) -> CheckRun:
     name = request.object or (run.metadata.get("object") or {}).get("name")
     if name is None:
         raise UserError("the file does not name its object, whose inertia is needed: --object names a mesh")
-    solid = load_mesh(name, run.metadata.get("unit", "m"))
+    solid = load_mesh(name, unit=run.metadata.get("unit", "m"))
     if not solid.watertight or not solid.mesh.volume > 0:
         raise UserError(
             f"{name} encloses no volume, so its inertia is unknown; repair it or name another --object"
@@ -310,7 +310,7 @@ def _disturbed(
         disturbance=np.tile(push, (1, n, 1)),
         gravity=gravity,
     )
-    settled = np.asarray(out.settled(NEAR, float(LEVEL)))
+    settled = np.asarray(out.settled(position=NEAR, orientation=float(LEVEL)))
     fine = (Status.COMMANDED.value, Status.PROJECTED.value)
     good = np.isin(np.asarray(out.status), fine).all(axis=0) & (settled < STEPS)
     use = np.asarray(out.cone_use).max(axis=0)

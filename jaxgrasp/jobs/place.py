@@ -147,7 +147,7 @@ def prepare_place(request: PlaceRequest) -> PlaceRun:
         asked.append(kind(float(distance)))
     friction, torsion = coefficients(request.model, request.friction, request.torsion)
     _enough_fingers(request.fingers, friction, torsion)
-    body = load_mesh(request.source, request.unit)
+    body = load_mesh(request.source, unit=request.unit)
     name = Path(request.source).name.removesuffix(".gz")
     stem = name if request.source in OBJECTS else Path(name).stem
     output = request.output or Path(f"{stem}.placed.parquet")
@@ -227,7 +227,7 @@ def place(run: PlaceRun, progress: Callable[[str, int, str], None] | None = None
 
     tell("measuring the object", 0, "")
     with precision("float64"):
-        surface = MeshSurface.from_body(run.body, request.resolution)
+        surface = MeshSurface.from_body(run.body, resolution=request.resolution)
         tell("screening", 0, "compiling")
         found = place_contacts(
             surface,

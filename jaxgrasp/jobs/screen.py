@@ -162,7 +162,7 @@ def _one(
     removed: dict[str, int] = {}
     offered = len(contacts)
     if run.filter:
-        reasons = geometric_filter(contacts.position, contacts.normal, friction, active)
+        reasons = geometric_filter(contacts.position, contacts.normal, friction=friction, active=active)
         removed = {reason: int(rows.sum()) for reason, rows in reasons.items()}
         kept = ~np.any(list(reasons.values()), axis=0)
         contacts = Contacts(*(getattr(contacts, name)[kept] for name in Contacts.__dataclass_fields__))
