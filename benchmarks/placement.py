@@ -44,7 +44,8 @@ import jaxgrasp as jg
 from jaxgrasp import objects, surfaces
 from jaxgrasp.contacts.models import ContactModel
 from jaxgrasp.placement.objectives import Epsilon, Margin, lessons
-from jaxgrasp.placement.place import CANDIDATES, Placement, place_contacts
+from jaxgrasp.placement.place import Placement, place_contacts
+from jaxgrasp.placement.search import CANDIDATES, Search
 from jaxgrasp.placement.settle import ROUNDS, TRIALS
 from jaxgrasp.quality.unit_wrench_space import effort_map, torque_lengths
 from jaxgrasp.surfaces.mesh import MeshSurface
@@ -178,8 +179,7 @@ def row(name: str, problem: Problem, starts: int, simplexes: int) -> dict[str, A
             fingers=problem.fingers,
             model=problem.model,
             objective=objective,
-            starts=starts,
-            seed=1,
+            search=Search(starts, seed=1),
         )
 
     place()  # compiles
@@ -251,10 +251,12 @@ def costs() -> list[dict[str, Any]]:
         problem = Problem(surface, fingers, model)
         for objective in (Margin(), Epsilon("L1", problem.radius), Epsilon("Linf", problem.radius)):
             first = time.perf_counter()
-            place_contacts(surface, fingers=fingers, model=model, objective=objective, starts=64)
+            place_contacts(surface, fingers=fingers, model=model, objective=objective, search=Search(64))
             first = time.perf_counter() - first
             begin = time.perf_counter()
-            out = place_contacts(surface, fingers=fingers, model=model, objective=objective, starts=256)
+            out = place_contacts(
+                surface, fingers=fingers, model=model, objective=objective, search=Search(256)
+            )
             seconds = time.perf_counter() - begin
             name = f"{type(objective).__name__} {getattr(objective, 'norm', '')}".strip()
             rows.append({

@@ -39,6 +39,7 @@ from ..placement import (
     Placement,
     PlacementProgress,
     Requirement,
+    Search,
     place_contacts,
 )
 from ..report import Verdict, draw
@@ -231,15 +232,14 @@ def place(run: PlaceRun, progress: Callable[[str, int, str], None] | None = None
         tell("screening", 0, "compiling")
         found = place_contacts(
             surface,
-            request.fingers,
-            MODELS[request.model]().with_coefficients(jnp.asarray(run.friction), jnp.asarray(run.torsion)),
-            OBJECTIVES[request.objective](float(surface.radius)),
-            request.starts,
-            request.steps,
+            fingers=request.fingers,
+            model=MODELS[request.model]().with_coefficients(
+                jnp.asarray(run.friction), jnp.asarray(run.torsion)
+            ),
+            objective=OBJECTIVES[request.objective](float(surface.radius)),
             requirements=run.requirements,
-            candidates=request.candidates,
+            search=Search(request.starts, request.steps, request.candidates, seed=request.seed),
             best=request.best,
-            seed=request.seed,
             progress=climbed,
         )
         kept = np.flatnonzero(np.asarray(found.verdict.status) == Status.RESISTANT)
