@@ -32,6 +32,7 @@ import jaxgrasp as jg
 from jaxgrasp import surfaces
 from jaxgrasp.placement.place import place_contacts
 from jaxgrasp.placement.requirements import Apart
+from jaxgrasp.placement.search import Search
 
 jax.config.update("jax_enable_x64", True)  # without it JAX computes in float32
 
@@ -117,7 +118,9 @@ figure.tight_layout()
 # grasps, each solved again and proved by the independent checker.
 
 # %%
-placed = place_contacts(surface, fingers=3, model=model, starts=64, steps=100, requirements=[Apart(0.02)])
+placed = place_contacts(
+    surface, fingers=3, model=model, requirements=[Apart(0.02)], search=Search(64, steps=100)
+)
 print(
     f"resistant: {np.mean(placed.before > 0):.0%} of the starts, {np.mean(placed.resistant):.0%} of the ends"
 )

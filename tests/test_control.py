@@ -154,9 +154,9 @@ def test_a_disturbed_grasp_recovers_and_settling_is_counted():
     out = loop(ring(), rested(np.zeros((LANES, 3))), 30.0, disturbance=push)
     error = np.asarray(out.position_error)[:, 0]
     assert error[:51].max() < 1e-7 < 1e-3 < error.max() and error[-1] < 1e-5
-    step = int(out.settled(1e-4, 1e-2)[0])
+    step = int(out.settled(position=1e-4, orientation=1e-2)[0])
     assert error[step:].max() <= 1e-4 < error[step - 1]
-    assert int(out.settled(1e-12, 1e-12)[0]) == STEPS
+    assert int(out.settled(position=1e-12, orientation=1e-12)[0]) == STEPS
 
 
 def test_a_trajectory_is_followed():
