@@ -14,3 +14,9 @@ print(f"starts that hold: {np.sum(placed.before > 0)} of 16, ends that hold: {pl
 print(f"best margin: {placed.before.max():.1f} at the starts, {placed.value[0]:.1f} at the ends")
 print("the median margin is larger at the ends:", np.median(placed.after) > np.median(placed.before))
 print("every grasp that is returned is proved:", placed.proved.all())
+
+# prints:
+# starts that hold: 16 of 16, ends that hold: 16 of 16
+# best margin: 0.9 at the starts, 1.0 at the ends
+# the median margin is larger at the ends: True
+# every grasp that is returned is proved: True

@@ -21,3 +21,9 @@ for row in best.slice(0, 3).to_pylist():
     print(
         f"grasp {row['grasp_id']}: margin {row['margin']:.4f}, first contact at z = {row['position'][0][2]:.4f} m"
     )
+
+# prints:
+# 2000 grasps, 178 hold
+# grasp 713: margin 0.8375, first contact at z = 0.0555 m
+# grasp 264: margin 0.7767, first contact at z = 0.0325 m
+# grasp 1453: margin 0.6771, first contact at z = 0.0605 m
