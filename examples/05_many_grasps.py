@@ -13,10 +13,11 @@ normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
 grasps = jg.Grasp(-0.04 * normal, normal, jg.HardFinger(friction=0.5))
 
 answers = jg.wrench_resistance(grasps)
-print(answers)
+for status in np.unique(answers.status):
+    print(jg.Status(int(status)).name, int((answers.status == status).sum()))
 best = int(np.nanargmax(answers.margin))
 print(f"best: number {best}, margin {answers.margin[best]:.4f}")
-print(f"of those that hold the median margin is {np.median(answers[answers.status == 1].margin):.4f}")
+print(f"of those that hold the median margin is {np.median(answers[answers.status == jg.Status.RESISTANT].margin):.4f}")
 print("all proved again:", jg.check(grasps, answers).all())
 
 # A function of one grasp becomes one of many by jax.vmap, too.

@@ -20,7 +20,7 @@ for motor in (8.0, 6.5, 5.0):  # N, of both jaws together
     limits = jg.TorqueLimits(jacobian, np.array([motor]), axes="world", orientation=orientation)
     answer = jg.optimize_forces(grasp, weight, torque_limits=limits)
     proved = jg.check(grasp, answer, wrench=weight, criterion=jg.Gentlest(), torque_limits=limits)
-    print(f"motor of {motor} N: {answer} Proved again: {proved}")
+    print(f"motor of {motor} N: {jg.Status(int(answer.status)).name}, proved again: {proved}")
 
 # prints:
 # motor of 8.0 N: Optimal: the forces balance the load inside every cone, and the bound proves the cost. Cost between 3 and 3. Proved again: True

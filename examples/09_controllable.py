@@ -15,7 +15,9 @@ body = jg.RigidBody(0.2, 1e-4 * np.diag([1.0, 1.2, 1.5]))  # kg, kg m^2
 answer = jg.controllability(grasps, body, gravity=(0, 0, -9.81))
 for lane, name in enumerate(("above", "through")):
     print(f"Fingers {name} the centre of mass:")
-    print(jg.report.explain_controllability(answer, lane))
+    print(jg.Status(int(answer.status[lane])).name, "rank", int(answer.rank[lane]), "of 12")
+    if not np.isfinite(answer.effort[lane]):
+        print(jg.report.explain_controllability(answer, lane).splitlines()[-1])
 
 # prints:
 # Fingers above the centre of mass:

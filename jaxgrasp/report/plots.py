@@ -49,6 +49,7 @@ def panels_in_a_row(count: int, size: tuple[float, float], **options: Any) -> tu
     """A figure with ``count`` panels in a row, in the notebooks' style."""
     import matplotlib.pyplot as plt
 
+    plt.get_backend()  # chosen before the context, which would undo what the choice sets
     with plt.rc_context(STYLE):
         return plt.subplots(1, count, figsize=size, layout="constrained", **options)
 
