@@ -2,6 +2,7 @@
 
 from .answer import Answer
 from .arrays import Array, Bool, Float, Int, real_array
+from .broadcast import spread
 from .errors import UserError
 from .geometry import (
     applied,
@@ -26,6 +27,7 @@ from .rotations import (
     rotation_between,
     turned,
 )
+from .select import first_of
 from .status import Status
 from .tolerances import (
     balance_tolerance,
@@ -60,6 +62,7 @@ __all__ = [
     "cross",
     "cross_components",
     "edge_tolerance",
+    "first_of",
     "frame_components",
     "gap_floor",
     "identity_orientation",
@@ -80,6 +83,7 @@ __all__ = [
     "rounding_constant",
     "safe_root",
     "skew",
+    "spread",
     "stationary_tolerance",
     "turned",
     "unit_roundoff",
