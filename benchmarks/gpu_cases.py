@@ -49,7 +49,7 @@ class Task(NamedTuple):
 
 # The library's public face: every use of it is in this section ---------------------------------------------
 
-CRITERIA: dict[str, Callable[[], jg.Criterion]] = {
+CRITERIA: dict[str, Callable[[], jg.forces.Criterion]] = {
     "gentlest": jg.Gentlest,
     "robust": jg.Robust,
     "smallest-sum": jg.SmallestSum,
@@ -75,9 +75,7 @@ def answer_of(kind: str, data: tuple[Any, ...], tolerance: Any = 1e-8) -> Any:
 
 def bracket_of(answer: Any) -> tuple[Any, Any]:
     """Proven lower and upper bound of the margin or of the cost."""
-    if isinstance(answer, jg.WrenchResistance):
-        return answer.margin, answer.margin + answer.gap
-    return answer.bound, answer.cost
+    return answer.lower, answer.upper
 
 
 def evidence_of(answer: Any) -> tuple[Any, Any]:
@@ -87,7 +85,8 @@ def evidence_of(answer: Any) -> tuple[Any, Any]:
 
 def proved(kind: str, data: tuple[np.ndarray, ...], answer: Any) -> np.ndarray:
     """(N,) bool: the independent checker accepts the answer of each lane."""
-    return np.asarray(jg.check_certificate(grasp_of(data), answer))
+    asked = {"wrench": data[3], "criterion": CRITERIA[kind]()} if kind in CRITERIA else {}
+    return np.asarray(jg.check(grasp_of(data), answer, **asked))
 
 
 # Data --------------------------------------------------------------------------------------------------
