@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jaxgrasp.conic import cone as cones
-from jaxgrasp.conic.scaling import nesterov_todd
+from jaxgrasp.conic.nesterov_todd import nesterov_todd
 
 K, LANES = 3, 40
 DIMENSIONS = [1, 2, 3, 4]
@@ -67,7 +67,7 @@ def test_reductions_over_cones():
 def test_jordan_product_is_the_arrow_matrix(d):
     rng = np.random.default_rng(d)
     x, y = rng.normal(size=(2, d, K, LANES))
-    product = dense(cones.scaled_product(cone(x), cone(y)))
+    product = dense(cones.jordan_product(cone(x), cone(y)))
     for i, j in each():
         np.testing.assert_allclose(product[:, i, j], arrow(x[:, i, j]) @ y[:, i, j], rtol=1e-12, atol=1e-13)
 

@@ -83,15 +83,15 @@ def answers():
 def test_the_equilibrium_is_found_when_no_forces_are_given(answers):
     grasp, given = answers
     found = jg.controllability(grasp, BODY)
-    for name in ("verdict", "rank", "reduced_rank", "grasp_rank"):
+    for name in ("status", "rank", "reduced_rank", "grasp_rank"):
         np.testing.assert_array_equal(getattr(found, name), getattr(given, name), err_msg=name)
-    assert int(found.point[list(CASES).index("from above")]) == jg.Status.NO_EQUILIBRIUM
+    assert int(found.equilibrium[list(CASES).index("from above")]) == jg.Status.NO_EQUILIBRIUM
     weightless = jg.controllability(grasp, BODY, gravity=(0, 0, 0))
     names = list(CASES)
     resistant = [i for i, n in enumerate(names) if CASES[n][-1] == V.RESISTANT]
-    assert set(np.asarray(weightless.verdict)[resistant].tolist()) == {V.RESISTANT.value}
+    assert set(np.asarray(weightless.status)[resistant].tolist()) == {V.RESISTANT.value}
     # pushing only from below: no forces but none at all hold a weightless object, so the rank proves nothing
-    assert V(int(weightless.verdict[names.index("three from below")])) == V.MARGINAL
+    assert V(int(weightless.status[names.index("three from below")])) == V.MARGINAL
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -99,7 +99,7 @@ def test_fixed_cases(answers, name):
     _, found = answers
     lane = list(CASES).index(name)
     *_, grasp_rank, rank, verdict = CASES[name]
-    assert V(int(found.verdict[lane])) == verdict
+    assert V(int(found.status[lane])) == verdict
     if name == "on the edge":
         assert int(found.reduced_rank[lane]) == 6
         return
@@ -119,7 +119,7 @@ def test_the_uncontrollable_motion_is_the_one_to_picture(answers):
     ):
         np.testing.assert_allclose(found.uncontrollable[names.index(name)], wanted, atol=1e-9)
     # it is one: neither the forces nor their turning with the body do work along it
-    low = np.flatnonzero(np.asarray(found.verdict) == V.NOT_CONTROLLABLE)
+    low = np.flatnonzero(np.asarray(found.status) == V.NOT_CONTROLLABLE)
     G = np.asarray(jg.contacts.folded_grasp_map(grasp))[low]
     linear = jg.linearize(grasp, BODY, force=found.force)
     M = np.diag([0.2] * 3 + [1e-4, 1.2e-4, 1.5e-4])
@@ -159,7 +159,7 @@ def test_without_gravity_nothing_helps_the_fingers(answers):
     found = jg.controllability(grasp, BODY, gravity=(0, 0, 0), force=force)
     np.testing.assert_array_equal(found.rank, 2 * found.grasp_rank)
     lane = list(CASES).index("two hard, line above")
-    assert V(int(found.verdict[lane])) == V.NOT_CONTROLLABLE
+    assert V(int(found.status[lane])) == V.NOT_CONTROLLABLE
 
 
 def least_squeezed(grasp, force, lane):
@@ -183,14 +183,14 @@ def test_given_forces_are_judged_and_change_no_rank(answers):
     grasp, found = answers
     lane = list(CASES).index("tetrahedron")
     force = np.asarray(found.force)
-    point = jg.linearize(grasp, BODY, force=force).point
-    there = np.asarray(found.verdict) != V.NO_EQUILIBRIUM
-    np.testing.assert_array_equal(np.asarray(point)[there], np.asarray(found.point)[there])
+    point = jg.linearize(grasp, BODY, force=force).status
+    there = np.asarray(found.status) != V.NO_EQUILIBRIUM
+    np.testing.assert_array_equal(np.asarray(point)[there], np.asarray(found.equilibrium)[there])
     assert set(np.asarray(point)[~there].tolist()) == {jg.Status.NOT_BALANCED.value}
     pulling = jg.linearize(grasp, BODY, force=-force)
-    assert int(pulling.point[lane]) == jg.Status.NOT_BALANCED
+    assert int(pulling.status[lane]) == jg.Status.NOT_BALANCED
     edge = jg.linearize(grasp, BODY, force=least_squeezed(grasp, force, lane))
-    assert int(edge.point[lane]) == jg.Status.MARGINAL
+    assert int(edge.status[lane]) == jg.Status.MARGINAL
     np.testing.assert_array_equal(edge.A[lane], jg.linearize(grasp, BODY, force=force).A[lane])
 
 
@@ -354,7 +354,7 @@ def test_verdicts_do_not_depend_on_axes_or_units(answers):
     other = jg.controllability(moved, body, gravity=turn @ [0, 0, -9.81])
     edge = list(CASES).index("on the edge")  # rounding pushes it over the edge or not
     same = np.arange(len(CASES)) != edge
-    np.testing.assert_array_equal(np.asarray(other.verdict)[same], np.asarray(found.verdict)[same])
+    np.testing.assert_array_equal(np.asarray(other.status)[same], np.asarray(found.status)[same])
     np.testing.assert_array_equal(np.asarray(other.rank)[same], np.asarray(found.rank)[same])
     np.testing.assert_allclose(other.singular_values, found.singular_values, atol=1e-9)
 
@@ -418,9 +418,9 @@ def test_bad_lanes_say_so_and_harm_no_other(answers):
     gravity[3, 0] = np.nan
     broken = jg.Grasp(position, grasp.normal, grasp.model, grasp.active)
     other = jg.controllability(broken, jg.RigidBody(mass, inertia), gravity=gravity, force=found.force)
-    assert set(np.asarray(other.verdict)[:4].tolist()) == {V.INVALID.value}
-    assert np.isnan(np.asarray(other.rank)[:4]).all()
-    for name in ("verdict", "rank", "singular_values", "uncontrollable", "effort", "force", "point"):
+    assert set(np.asarray(other.status)[:4].tolist()) == {V.INVALID.value}
+    np.testing.assert_array_equal(np.asarray(other.rank)[:4], -1)
+    for name in ("status", "rank", "singular_values", "uncontrollable", "effort", "force", "equilibrium"):
         np.testing.assert_array_equal(getattr(other, name)[4:], getattr(found, name)[4:], err_msg=name)
 
 
@@ -463,7 +463,7 @@ def test_planar_cases():
     wanted = [case[-3:] for case in PLANAR.values()]
     got = [
         (int(r), int(c), V(int(v)))
-        for r, c, v in zip(found.grasp_rank, found.rank, found.verdict, strict=True)
+        for r, c, v in zip(found.grasp_rank, found.rank, found.status, strict=True)
     ]
     assert dict(zip(PLANAR, got, strict=True)) == dict(zip(PLANAR, wanted, strict=True))
     lane = list(PLANAR).index("one finger at the centre")

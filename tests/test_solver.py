@@ -14,10 +14,15 @@ import pytest
 from scipy.sparse import csc_matrix
 
 from jaxgrasp.backend import tiles as lanes
-from jaxgrasp.conic import linear
-from jaxgrasp.conic.cone_program import ConeProgram
-from jaxgrasp.conic.interior_point import Iterate, begin_cone_program, solve_cone_program
-from jaxgrasp.conic.linear import cholesky, cholesky_solve, gram, inverse_frobenius, matvec, rmatvec
+from jaxgrasp.conic import (
+    LinearConeProgram,
+    LinearPoint,
+    begin_linear_cone_program,
+    solve_linear_cone_program,
+)
+from jaxgrasp.conic.cholesky import cholesky, cholesky_solve, inverse_frobenius, solve_transposed
+from jaxgrasp.conic.gram_schmidt import orthonormal_rows
+from jaxgrasp.conic.products import gram, matvec, rmatvec
 from jaxgrasp.conic.singular_values import row_svd
 from jaxgrasp.core.status import Status
 
@@ -159,8 +164,8 @@ def split(x):
 
 
 def tile_of(B, b, c, y, u, z):
-    program = ConeProgram(columns_of(B, c.shape[-1]), vector(b), split(c), jnp.ones((K, len(B))), 0.25)
-    return program, Iterate(vector(y), split(u), split(z))
+    program = LinearConeProgram(columns_of(B, c.shape[-1]), vector(b), split(c), jnp.ones((K, len(B))), 0.25)
+    return program, LinearPoint(vector(y), split(u), split(z))
 
 
 def run(program, point, tolerance=1e-9, budget=40, skip=None):
@@ -168,8 +173,11 @@ def run(program, point, tolerance=1e-9, budget=40, skip=None):
 
     @jax.jit
     def go(program, point, skip, tolerance, budget):
-        return solve_cone_program(
-            program._replace(constant=0.25), begin_cone_program(program, point, skip), tolerance, budget
+        return solve_linear_cone_program(
+            program._replace(constant=0.25),
+            begin_linear_cone_program(program, point, skip),
+            tolerance,
+            budget,
         )
 
     return go(program, point, skip, jnp.asarray(tolerance), jnp.int32(budget))
@@ -200,17 +208,17 @@ def test_random_cone_programs_against_clarabel(d):
     assert (np.asarray(end.stop) == Status.CONVERGED).all()
     expected = np.array([clarabel_value(*one) for one in zip(*data[:3], strict=True)])
     size = np.maximum(1.0, np.abs(expected))
-    assert (np.abs(program.primal_value(end.iterate.u) - 0.25 - expected) <= 1e-7 * size).all()
-    assert (np.abs(program.dual_value(end.iterate.y) - 0.25 - expected) <= 1e-7 * size).all()
-    residual, complementarity = program.optimality(end.iterate.y, end.iterate.u)
+    assert (np.abs(program.primal_value(end.point.u) - 0.25 - expected) <= 1e-7 * size).all()
+    assert (np.abs(program.dual_value(end.point.y) - 0.25 - expected) <= 1e-7 * size).all()
+    residual, complementarity = program.optimality(end.point.y, end.point.u)
     assert max(float(jnp.max(jnp.abs(r))) for r in residual) < 1e-8
-    slack = program.slack(end.iterate.y)
+    slack = program.slack(end.point.y)
     assert (np.asarray(complementarity[0]).sum(0) <= 1e-8 * size).all()
     # |u_0 z_1 + z_0 u_1|^2 <= 2 u_0 z_0 <u, z> for any two points of the cone
-    bound = np.sqrt(2 * np.asarray(end.iterate.u[0] * slack[0] * np.maximum(complementarity[0], 0)))
+    bound = np.sqrt(2 * np.asarray(end.point.u[0] * slack[0] * np.maximum(complementarity[0], 0)))
     tail = np.sqrt(sum(np.asarray(x) ** 2 for x in complementarity[1:]))
     assert (tail <= bound + 1e-7).all()
-    for kept, exact in zip(end.iterate.z, slack, strict=True):
+    for kept, exact in zip(end.point.z, slack, strict=True):
         np.testing.assert_allclose(kept, exact, atol=1e-9)
     assert (np.asarray(end.iterations) <= 15).all()
 
@@ -238,7 +246,7 @@ def test_a_finished_lane_keeps_its_iterate_when_solved_again(tile):
     program, point = tile
     end = run(program, point)
     again = jax.jit(
-        lambda p, s: solve_cone_program(p._replace(constant=0.25), s, jnp.asarray(1e-14), jnp.int32(5))
+        lambda p, s: solve_linear_cone_program(p._replace(constant=0.25), s, jnp.asarray(1e-14), jnp.int32(5))
     )(program, end)
     assert lane_bits(end, slice(None)) == lane_bits(again, slice(None))
 
@@ -248,7 +256,7 @@ def test_budgets_of_nothing_and_of_one_step(tile):
     none = run(program, point, budget=0)
     assert (np.asarray(none.stop) == Status.RUNNING).all()
     assert (np.asarray(none.iterations) == 0).all()
-    assert lane_bits(none.iterate, slice(None)) == lane_bits(point, slice(None))
+    assert lane_bits(none.point, slice(None)) == lane_bits(point, slice(None))
     one = run(program, point, budget=1)
     assert (np.asarray(one.iterations) == 1).all()
     assert (np.asarray(one.gap) < np.asarray(none.gap)).all()
@@ -257,7 +265,9 @@ def test_budgets_of_nothing_and_of_one_step(tile):
 def test_interrupting_changes_no_bit(tile):
     program, point = tile
     whole = run(program, point, budget=9)
-    step = jax.jit(lambda p, s, n: solve_cone_program(p._replace(constant=0.25), s, jnp.asarray(1e-9), n))
+    step = jax.jit(
+        lambda p, s, n: solve_linear_cone_program(p._replace(constant=0.25), s, jnp.asarray(1e-9), n)
+    )
     half = step(program, run(program, point, budget=4), jnp.int32(5))
     assert lane_bits(whole, slice(None)) == lane_bits(half, slice(None))
 
@@ -270,7 +280,7 @@ def test_a_nan_lane_stays_alone_and_says_so(tile):
     others = np.flatnonzero(np.arange(LANES) != 3)
     assert lane_bits(clean, others) == lane_bits(dirty, others)
     assert int(dirty.stop[3]) == Status.BREAKDOWN
-    assert lane_bits(dirty.iterate, [3]) == lane_bits(point, [3])  # the best iterate: the start
+    assert lane_bits(dirty.point, [3]) == lane_bits(point, [3])  # the best iterate: the start
     assert int(dirty.iterations[3]) == 1
 
 
@@ -280,7 +290,7 @@ def test_skipped_lanes_never_run(tile):
     end = run(program, point, skip=skip)
     np.testing.assert_array_equal(np.asarray(end.stop) == Status.SKIPPED, skip)
     assert (np.asarray(end.iterations)[skip] == 0).all()
-    assert lane_bits(end.iterate, np.flatnonzero(skip)) == lane_bits(point, np.flatnonzero(skip))
+    assert lane_bits(end.point, np.flatnonzero(skip)) == lane_bits(point, np.flatnonzero(skip))
     assert (np.asarray(end.stop)[~skip] == Status.CONVERGED).all()
 
 
@@ -294,14 +304,14 @@ def test_an_impossible_tolerance_stalls_on_the_best_iterate(tile):
 
 def test_a_question_stops_the_lanes_it_is_answered_for(tile):
     program, point = tile
-    gap = begin_cone_program(program, point, jnp.zeros(LANES, bool)).gap
+    gap = begin_linear_cone_program(program, point, jnp.zeros(LANES, bool)).gap
 
     def decided(program, iterate):
         return program.primal_value(iterate.u) - program.dual_value(iterate.y) < 0.1
 
-    state = begin_cone_program(program, point, jnp.zeros(LANES, bool))
+    state = begin_linear_cone_program(program, point, jnp.zeros(LANES, bool))
     go = jax.jit(
-        lambda p, s: solve_cone_program(
+        lambda p, s: solve_linear_cone_program(
             p._replace(constant=0.25), s, jnp.asarray(1e-9), jnp.int32(40), decided
         )
     )
@@ -323,7 +333,7 @@ def test_padding_cones_take_no_part():
         exists=jnp.concatenate([program.exists, 0 * pad]),
     )
     unit = (pad, 0 * pad, 0 * pad)
-    wider = Iterate(
+    wider = LinearPoint(
         point.y,
         tuple(jnp.concatenate([x, e]) for x, e in zip(point.u, unit, strict=True)),
         tuple(jnp.concatenate([x, e]) for x, e in zip(point.z, unit, strict=True)),
@@ -331,7 +341,7 @@ def test_padding_cones_take_no_part():
     wide = run(padded, wider)
     np.testing.assert_array_equal(wide.stop, end.stop)
     np.testing.assert_allclose(
-        padded.primal_value(wide.iterate.u), program.primal_value(end.iterate.u), atol=1e-7
+        padded.primal_value(wide.point.u), program.primal_value(end.point.u), atol=1e-7
     )
 
 
@@ -415,7 +425,7 @@ def test_orthonormal_rows_reproduce_the_matrix(m, dtype):
     eps = np.finfo(dtype).eps
     floor = 64 * eps * np.sqrt((A**2).sum((0, 1, 2)))
     columns = tuple(jnp.asarray(A[:, :, j]) for j in range(3))
-    rows, factor = linear.orthonormal_rows(columns, jnp.asarray(floor.astype(dtype)))
+    rows, factor = orthonormal_rows(columns, jnp.asarray(floor.astype(dtype)))
     Q = np.stack([np.asarray(r) for r in rows], 2)
     L = np.zeros((m, m, 8))
     for j, column in enumerate(factor.columns):
@@ -426,9 +436,7 @@ def test_orthonormal_rows_reproduce_the_matrix(m, dtype):
     expected[-1, -1, 1] = 0
     np.testing.assert_allclose(product, expected, atol=50 * eps)
     y = rng.normal(size=(m, 8)).astype(dtype)
-    twist = np.stack(
-        [np.asarray(t) for t in linear.solve_transposed(factor, tuple(jnp.asarray(v) for v in y))]
-    )
+    twist = np.stack([np.asarray(t) for t in solve_transposed(factor, tuple(jnp.asarray(v) for v in y))])
     kept = np.delete(np.arange(8), [1, 2])
     np.testing.assert_allclose(np.einsum("jil,jl->il", L, twist)[:, kept], y[:, kept], atol=1e4 * eps)
 

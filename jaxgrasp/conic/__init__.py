@@ -3,25 +3,33 @@
 It has never heard of grasping: it knows cones, a few dense equality constraints, and lanes.
 """
 
-from .cone import Cone, cone_max, cone_min, cone_sum, determinant, inner, interior_distance, tail_norm
-from .cone_program import ConeProgram
-from .convex_interior_point import State, begin_convex_program, solve_convex_program
-from .convex_program import Bounds, ConvexProgram, Curvature, Point, as_vector
-from .derivatives import Shift, centring, lagrangian, point_tangent, residuals
-from .interior_point import Iterate, Progress, Step, advance, begin_cone_program, solve_cone_program
-from .linear import (
-    Cholesky,
-    Vector,
-    inverse_frobenius,
-    matvec,
-    null_combination,
-    orthonormal_rows,
-    rmatvec,
-    solve_lower,
-    solve_transposed,
-    vector_norm,
+from .cholesky import Cholesky, inverse_frobenius, null_combination, solve_lower, solve_transposed
+from .cone import (
+    Cone,
+    cone_all,
+    cone_any,
+    cone_max,
+    cone_min,
+    cone_sum,
+    determinant,
+    inner,
+    interior_distance,
+    tail_norm,
 )
-from .reduced_newton import Motion, newton_solve
+from .convex_cone_program import Bounds, ConvexConeProgram, ConvexPoint, Curvature
+from .convex_interior_point import ConvexState, begin_convex_cone_program, solve_convex_cone_program
+from .derivatives import PointShift, centring, lagrangian, point_tangent, residuals
+from .gram_schmidt import orthonormal_rows
+from .linear_cone_program import LinearConeProgram
+from .linear_interior_point import (
+    LinearState,
+    advance_linear_cone_program,
+    begin_linear_cone_program,
+    solve_linear_cone_program,
+)
+from .linear_newton_step import LinearPoint, LinearStep
+from .products import Vector, as_vector, matvec, rmatvec, vector_norm
+from .reduced_kkt import KKTVector, kkt_solve
 from .regularity import regular
 from .singular_values import row_svd
 
@@ -29,22 +37,24 @@ __all__ = [
     "Bounds",
     "Cholesky",
     "Cone",
-    "ConeProgram",
-    "ConvexProgram",
+    "ConvexConeProgram",
+    "ConvexPoint",
+    "ConvexState",
     "Curvature",
-    "Iterate",
-    "Motion",
-    "Point",
-    "Progress",
-    "Shift",
-    "State",
-    "Step",
+    "KKTVector",
+    "LinearConeProgram",
+    "LinearPoint",
+    "LinearState",
+    "LinearStep",
+    "PointShift",
     "Vector",
-    "advance",
+    "advance_linear_cone_program",
     "as_vector",
-    "begin_cone_program",
-    "begin_convex_program",
+    "begin_convex_cone_program",
+    "begin_linear_cone_program",
     "centring",
+    "cone_all",
+    "cone_any",
     "cone_max",
     "cone_min",
     "cone_sum",
@@ -52,9 +62,9 @@ __all__ = [
     "inner",
     "interior_distance",
     "inverse_frobenius",
+    "kkt_solve",
     "lagrangian",
     "matvec",
-    "newton_solve",
     "null_combination",
     "orthonormal_rows",
     "point_tangent",
@@ -62,8 +72,8 @@ __all__ = [
     "residuals",
     "rmatvec",
     "row_svd",
-    "solve_cone_program",
-    "solve_convex_program",
+    "solve_convex_cone_program",
+    "solve_linear_cone_program",
     "solve_lower",
     "solve_transposed",
     "tail_norm",

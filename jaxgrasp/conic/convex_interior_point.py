@@ -1,4 +1,4 @@
-"""The primal-dual interior-point method for a ``ConvexProgram``, one tile of lanes at a time.
+"""The primal-dual interior-point method for a ``ConvexConeProgram``, one tile of lanes at a time.
 
 Newton steps follow the central path ``u_i o z_i = (phi_i + mu) e``, ``slack price = floor + mu`` for mu to 0. The start
 is dual feasible and one step length serves both sides, so every y bounds the optimum from below; ``B u = b`` is reached
@@ -13,23 +13,22 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
 from ..backend import stage
-from ..core import Array, Status
+from ..core import Array, Status, first_of
 from .cone import cone_max, cone_min, cone_sum, inner, interior_distance
-from .convex_newton import measure, newton_step
-from .convex_program import ConvexProgram, Point
+from .convex_cone_program import ConvexConeProgram, ConvexPoint
+from .convex_newton_step import convex_newton_step, duality_excess
+from .stopping import StallRule, first_code, iterate_until_stopped
 
-__all__ = ["Answered", "State", "begin_convex_program", "solve_convex_program"]
+__all__ = ["ConvexState", "begin_convex_cone_program", "solve_convex_cone_program"]
 
-STALL_RATIO = 0.9  # a step that leaves more of the gap than this is slow
-PATIENCE = 4  # slow steps in a row before a lane gives up
+STALL = StallRule(patience=4)
 CENTRED = 1e3  # tails of u o z, in products, that still leave forces right to 1e-7 at a gap of 1e-8
 ALMOST = 1e-6  # slow steps count only once |b - B u| is below this: before, growth of y is progress
 
 
-class State(NamedTuple):
+class ConvexState(NamedTuple):
     """A tile between iterations.
 
     excess         (L,) sum of |product - floor|: the duality gap once B u = b
@@ -38,7 +37,7 @@ class State(NamedTuple):
     ray            (m + q, L) the multipliers that answered, where the lane stopped DECIDED
     """
 
-    point: Point
+    point: ConvexPoint
     excess: Array
     infeasibility: Array
     centred: Array
@@ -48,11 +47,47 @@ class State(NamedTuple):
     stop: Array
 
 
-Answered = Callable[[ConvexProgram, Array], Array]  # (program, rows) -> (L,) bool: rows prove infeasibility
+class Question(NamedTuple):
+    """What is asked of a tile.
+
+    tolerance  (L,) or a number: duality gap to reach, relative to the objective
+    proves     ``(program, rows) -> (L,) bool``: multipliers that prove the constraints contradictory
+    rounding   |b - B u| that is rounding
+    """
+
+    tolerance: Array
+    proves: Callable[[ConvexConeProgram, Array], Array]
+    rounding: float
+
+
+class Measures(NamedTuple):
+    """A point in numbers, (L,) each: ``close`` where gap and infeasibility are small enough to end at."""
+
+    excess: Array
+    infeasibility: Array
+    centred: Array
+    close: Array
+
+
+class Interior(NamedTuple):
+    """How far inside a point lies (L,): smallest primal and dual slack, largest u_0."""
+
+    primal: Array
+    dual: Array
+    largest: Array
+
+
+class Multipliers(NamedTuple):
+    """The multipliers of a point and of the step to it (m + q, L), and whether they prove infeasibility (L,)."""
+
+    rows: Array
+    step: Array
+    proven: Array
+    proven_by_step: Array
 
 
 @stage
-def _infeasibility(program: ConvexProgram, point: Point) -> Array:
+def _infeasibility(program: ConvexConeProgram, point: ConvexPoint) -> Array:
     applied, product = program.products(point.u)
     residual = program.rhs - applied
     square = jnp.zeros_like(residual[0])
@@ -66,8 +101,7 @@ def _infeasibility(program: ConvexProgram, point: Point) -> Array:
 
 
 @stage
-def _room(program: ConvexProgram, point: Point) -> tuple[Array, Array, Array]:
-    """Smallest primal and smallest dual slack, largest u_0 (L,)."""
+def _interior(program: ConvexConeProgram, point: ConvexPoint) -> Interior:
 
     def least(x: Array, mask: Array) -> Array:
         return cone_min(jnp.where(mask > 0, x, jnp.full_like(x, jnp.inf)))
@@ -78,11 +112,11 @@ def _room(program: ConvexProgram, point: Point) -> tuple[Array, Array, Array]:
         if mask is not None:
             primal = jnp.minimum(primal, least(slack, mask))
             dual = jnp.minimum(dual, least(price, mask))
-    return primal, dual, cone_max(program.exists * jnp.abs(point.u[0]))
+    return Interior(primal, dual, cone_max(program.exists * jnp.abs(point.u[0])))
 
 
 @stage
-def _centred(program: ConvexProgram, point: Point) -> Array:
+def _centred(program: ConvexConeProgram, point: ConvexPoint) -> Array:
     """Whether ``|u_0 z_t + z_0 u_t|`` is small next to ``<u, z>`` in every cone (L,)."""
     u, z = point.u, point.z
     square = jnp.zeros_like(u[0])
@@ -94,7 +128,7 @@ def _centred(program: ConvexProgram, point: Point) -> Array:
 
 
 @stage
-def _select(taken: Array, new: Point, old: Point) -> Point:
+def _select(taken: Array, new: ConvexPoint, old: ConvexPoint) -> ConvexPoint:
     return jax.tree.map(lambda a, b: jnp.where(taken, a, b), new, old)
 
 
@@ -105,55 +139,9 @@ def _closed(goal: Array, excess: Array, infeasibility: Array) -> Array:
 
 
 @stage
-def _goal(program: ConvexProgram, point: Point, tolerance: Array) -> Array:
+def _goal(program: ConvexConeProgram, point: ConvexPoint, tolerance: Array) -> Array:
     """The gap to reach (L,)."""
     return tolerance * program.size(point)
-
-
-@stage
-def _judged(
-    state: State, point: Point, excess: Array, infeasibility: Array, centred: Array, primal: Array,
-    dual: Array, close: Array, was_close: Array, proven: Array, by_step: Array, rows: Array, change: Array,
-    largest: Array, fine: float,
-) -> State:  # fmt: skip
-    """Take the step in the lanes where it is sound; say why the others stop."""
-    running = state.stop == Status.RUNNING.value
-    slow = (excess > STALL_RATIO * state.excess) & (infeasibility > STALL_RATIO * state.infeasibility)
-    slow = slow & (infeasibility < ALMOST) & running
-    stalled = jnp.where(slow, state.stalled + 1, jnp.zeros_like(state.stalled))
-    met = infeasibility <= jnp.maximum(0.1 * primal, fine * (1 + largest))
-    sound = (primal > 0) & (dual > 0)
-
-    def code(stop: Status, where: Array, otherwise: Array) -> Array:
-        return jnp.where(where, jnp.int32(stop.value), otherwise)
-
-    stop = code(Status.STALLED, stalled >= PATIENCE, jnp.zeros_like(state.stop))
-    stop = code(Status.BREAKDOWN, ~sound, stop)
-    stop = code(Status.DECIDED, (proven | by_step) & ~was_close, stop)
-    stop = code(Status.CONVERGED, sound & close & met & centred, stop)
-    ray = jnp.where(running & by_step, change, jnp.where(running, rows, state.ray))
-    iterations = jnp.where(running, state.iterations + 1, state.iterations)
-    stop = jnp.where(running, stop, state.stop)
-    return State(point, excess, infeasibility, centred, ray, iterations, stalled, stop)
-
-
-def advance(program: ConvexProgram, state: State, tolerance: Array, proves: Answered, fine: float) -> State:
-    """One iteration of every running lane."""
-    goal = _goal(program, state.point, tolerance)
-    was_close = _closed(goal, state.excess, state.infeasibility)
-    moved, step = newton_step(
-        program, state.point, state.excess, state.infeasibility, goal, was_close, state.centred
-    )
-    primal, dual, largest = _room(program, moved)
-    point = _select(_running_and(state.stop, primal, dual), moved, state.point)
-    excess, _ = measure(program, point.u, point.z, point.slack, point.price)
-    infeasibility = _infeasibility(program, point)
-    close = _closed(_goal(program, point, tolerance), excess, infeasibility)
-    rows, centred = _rows(point), _centred(program, point)
-    return _judged(
-        state, point, excess, infeasibility, centred, primal, dual, close, was_close, proves(program, rows),
-        proves(program, step.rows), rows, step.rows, largest, fine,
-    )  # fmt: skip
 
 
 @stage
@@ -162,35 +150,86 @@ def _running_and(stop: Array, primal: Array, dual: Array) -> Array:
 
 
 @stage
-def _rows(point: Point) -> Array:
+def _rows(point: ConvexPoint) -> Array:
     return point.rows()
 
 
-def begin_convex_program(program: ConvexProgram, point: Point, skip: Array) -> State:
+def _multipliers(
+    program: ConvexConeProgram, point: ConvexPoint, step: Array, question: Question
+) -> Multipliers:
+    rows = _rows(point)
+    return Multipliers(rows, step, question.proves(program, rows), question.proves(program, step))
+
+
+@stage
+def _next_state(
+    state: ConvexState, point: ConvexPoint, now: Measures, was_close: Array, interior: Interior,
+    multipliers: Multipliers, rounding: float,
+) -> ConvexState:  # fmt: skip
+    """The state after a step; why the lanes that stop here do so."""
+    running = state.stop == Status.RUNNING.value
+    slow = STALL.slow(now.excess, state.excess) & STALL.slow(now.infeasibility, state.infeasibility)
+    slow = slow & (now.infeasibility < ALMOST) & running
+    stalled = STALL.count(slow, state.stalled)
+    met = now.infeasibility <= jnp.maximum(0.1 * interior.primal, rounding * (1 + interior.largest))
+    sound = (interior.primal > 0) & (interior.dual > 0)
+    proven, by_step = multipliers.proven, multipliers.proven_by_step
+    stop = first_of(
+        [
+            (sound & now.close & met & now.centred, Status.CONVERGED),
+            ((proven | by_step) & ~was_close, Status.DECIDED),
+            (~sound, Status.BREAKDOWN),
+            (STALL.broken(stalled), Status.STALLED),
+        ],
+        Status.RUNNING,
+    )
+    ray = jnp.where(running & by_step, multipliers.step, jnp.where(running, multipliers.rows, state.ray))
+    iterations = jnp.where(running, state.iterations + 1, state.iterations)
+    stop = jnp.where(running, stop, state.stop)
+    return ConvexState(point, now.excess, now.infeasibility, now.centred, ray, iterations, stalled, stop)
+
+
+def begin_convex_cone_program(program: ConvexConeProgram, point: ConvexPoint, skip: Array) -> ConvexState:
     """The state before the first step; lanes in ``skip`` never run."""
-    excess, _ = measure(program, point.u, point.z, point.slack, point.price)
+    excess, _ = duality_excess(program, point)
     zero = jnp.zeros(excess.shape, jnp.int32)
-    code = jnp.where(skip, jnp.int32(Status.SKIPPED.value), jnp.int32(Status.RUNNING.value))
     infeasibility, centred = _infeasibility(program, point), jnp.zeros_like(skip)
-    return State(point, excess, infeasibility, centred, _rows(point), zero, zero, code)
+    return ConvexState(point, excess, infeasibility, centred, _rows(point), zero, zero, first_code(skip))
 
 
-def solve_convex_program(
-    program: ConvexProgram, state: State, tolerance: Array, proves: Answered, budget: Array, fine: float
-) -> State:
-    """Iterate until every lane has stopped or ``budget`` more steps are spent.
+def advance_convex_cone_program(
+    program: ConvexConeProgram, state: ConvexState, question: Question
+) -> ConvexState:
+    """One iteration of every running lane: step, keep it where it is sound, measure, judge."""
+    goal = _goal(program, state.point, question.tolerance)
+    was_close = _closed(goal, state.excess, state.infeasibility)
+    moved, step = convex_newton_step(
+        program, state.point, state.excess, state.infeasibility, goal, was_close, state.centred
+    )
+    interior = _interior(program, moved)
+    point = _select(_running_and(state.stop, interior.primal, interior.dual), moved, state.point)
+    now = _measures(program, point, question.tolerance)
+    multipliers = _multipliers(program, point, step.rows, question)
+    return _next_state(state, point, now, was_close, interior, multipliers, question.rounding)
 
-    tolerance  of the duality gap, relative to the objective
-    proves     ``(program, rows) -> (L,) bool``: multipliers that prove the constraints contradictory
-    fine       |b - B u| that is rounding
-    """
 
-    def unfinished(carry: tuple[Array, State]) -> Array:
-        count, state = carry
-        return (count < budget) & jnp.any(state.stop == Status.RUNNING.value)
+def _measures(program: ConvexConeProgram, point: ConvexPoint, tolerance: Array) -> Measures:
+    excess, _ = duality_excess(program, point)
+    infeasibility = _infeasibility(program, point)
+    close = _closed(_goal(program, point, tolerance), excess, infeasibility)
+    return Measures(excess, infeasibility, _centred(program, point), close)
 
-    def body(carry: tuple[Array, State]) -> tuple[Array, State]:
-        count, state = carry
-        return count + 1, advance(program, state, tolerance, proves, fine)
 
-    return lax.while_loop(unfinished, body, (jnp.int32(0), state))[1]
+def solve_convex_cone_program(
+    program: ConvexConeProgram,
+    state: ConvexState,
+    tolerance: Array,
+    proves: Callable[[ConvexConeProgram, Array], Array],
+    budget: Array,
+    rounding: float,
+) -> ConvexState:
+    """Iterate until every lane has stopped or ``budget`` more steps are spent; the rest as in ``Question``."""
+    question = Question(tolerance, proves, rounding)
+    return iterate_until_stopped(
+        lambda state: advance_convex_cone_program(program, state, question), state, budget
+    )

@@ -1,11 +1,11 @@
-"""Whether a solved ``ConvexProgram`` has one solution that moves smoothly with its data.
+"""Whether a solved ``ConvexConeProgram`` has one solution that moves smoothly with its data.
 
     strictly complementary: of each pair of eigenvalues of u and z, and of each slack and its price, one is positive
-    unique:                 the Newton matrix is regular at the solution, for u and for multipliers
+    unique:                 the reduced KKT matrix is regular at the solution, for u and for multipliers
 
 Then solution and multipliers are differentiable (Fiacco 1983, theorem 2.4.1). On the central path a pair that
 should be (positive, 0) is (a, mu / a), and one that is (0, 0) has two members of size sqrt(mu): the ratio tells. A
-singular Newton matrix shows in the response to a right-hand side without structure: 1 / mu instead of 1.
+singular matrix shows in the response to a right-hand side without structure: 1 / mu instead of 1.
 """
 
 from __future__ import annotations
@@ -14,32 +14,30 @@ import jax.numpy as jnp
 
 from ..backend import stage
 from ..core import Array, complementary_ratio, largest_response
-from .arrow_blocks import Frame
 from .cone import Cone, cone_max
-from .convex_program import Bounds, ConvexProgram, Optional, Point
-from .kkt import factor
-from .linear import vector_norm
-from .reduced_newton import newton_at
+from .convex_cone_program import Bounds, ConvexConeProgram, ConvexPoint
+from .jordan_frame import JordanFrame
+from .products import as_vector, vector_norm
+from .reduced_kkt import ReducedKKT, reduced_kkt
+from .scaled_kkt import ScaledDirection, ScaledSides, factor_scaled_kkt
 
 __all__ = ["regular"]
 
 
-def regular(program: ConvexProgram, point: Point) -> Array:
+def regular(program: ConvexConeProgram, point: ConvexPoint) -> Array:
     """(L,) bool, for a program of orthonormal rows B near its solution."""
-    newton, acting = _newton(program, point), _acting(program)
-    kkt = factor(program, newton.frame, newton.rates)
-    h, head, level, rows = _probe(program, newton.frame, acting)
-    response = kkt.solve(h, head, level if program.level is not None else None, rows)
-    return _verdict(
-        program, point, newton.stiffness, newton.frame, acting, response.p, response.xi, response.rows
+    kkt, effective = _stored(program, point), _effective(program)
+    factored = factor_scaled_kkt(program, kkt.frame, kkt.rates)
+    return _strict_and_unique(
+        program, point, kkt, effective, factored.solve(_probe(program, kkt.frame, effective))
     )
 
 
-_newton = stage(newton_at)
+_stored = stage(reduced_kkt)
 
 
 @stage
-def _acting(program: ConvexProgram) -> Cone:
+def _effective(program: ConvexConeProgram) -> Cone:
     """Ones where a component of u has any effect; a contact without friction has tails that have none."""
     out = []
     for j, c in enumerate(program.columns):
@@ -55,7 +53,7 @@ def _acting(program: ConvexProgram) -> Cone:
 
 
 @stage
-def _probe(program: ConvexProgram, frame: Frame, acting: Cone) -> tuple[Cone, Array, Array, Array]:
+def _probe(program: ConvexConeProgram, frame: JordanFrame, effective: Cone) -> ScaledSides:
     """Numbers of size 1 without structure: a fixed sequence of multiples of the golden ratio."""
     exists, count = program.exists, 0
 
@@ -67,18 +65,21 @@ def _probe(program: ConvexProgram, frame: Frame, acting: Cone) -> tuple[Cone, Ar
             rows.append(jnp.full_like(x[0], 2 * ((0.6180339887498949 * count) % 1) - 1))
         return jnp.stack(rows)
 
-    u = tuple(a * next_like(exists) for a in acting)
+    u = tuple(a * next_like(exists) for a in effective)
     total = jnp.zeros((program.columns[0].shape[0], *exists.shape[1:]), exists.dtype)
     rows = next_like(total)
-    level = jnp.full_like(exists[0], 0.5)
-    return frame.scale(frame.to_frame(u)), jnp.zeros_like(exists), level, rows
+    level = None if program.level is None else jnp.full_like(exists[0], 0.5)
+    return ScaledSides(frame.scale(frame.to_frame(u)), jnp.zeros_like(exists), level, rows)
 
 
 @stage
-def _verdict(
-    program: ConvexProgram, point: Point, stiffness: Cone, frame: Frame, acting: Cone, p: Cone, xi: Optional,
-    rows: Array,
-) -> Array:  # fmt: skip
+def _strict_and_unique(
+    program: ConvexConeProgram,
+    point: ConvexPoint,
+    kkt: ReducedKKT,
+    effective: Cone,
+    response: ScaledDirection,
+) -> Array:
     dtype = program.exists.dtype
     ratio = jnp.asarray(complementary_ratio(dtype), dtype)
     strict = jnp.ones_like(program.exists[0]) > 0
@@ -90,7 +91,7 @@ def _verdict(
             strict = strict & apart[i]
 
     if program.cone_floor is None:
-        for h in stiffness[:2]:  # eigenvalues of z over those of u
+        for h in kkt.stiffness[:2]:  # eigenvalues of z over those of u
             separated(h, jnp.ones_like(h), program.exists)
     masks: Bounds = program.masks()
     if program.head_floor is not None:
@@ -99,10 +100,10 @@ def _verdict(
         if mask is not None:
             separated(slack, price, mask)
 
-    du = frame.from_frame(frame.scale(p))
-    size = vector_norm(tuple(rows[i] for i in range(rows.shape[0])))
-    for a, x in zip(acting, du, strict=True):
+    du = kkt.frame.from_frame(kkt.frame.scale(response.p))
+    size = vector_norm(as_vector(response.rows))
+    for a, x in zip(effective, du, strict=True):
         size = jnp.maximum(size, cone_max(a * jnp.abs(x)))
-    if xi is not None:
-        size = jnp.maximum(size, jnp.abs(xi))
+    if response.xi is not None:
+        size = jnp.maximum(size, jnp.abs(response.xi))
     return strict & (size <= jnp.asarray(largest_response(dtype), dtype))  # NaN compares false

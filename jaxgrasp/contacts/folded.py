@@ -7,12 +7,13 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from ..backend import stage, to_lanes
-from ..conic import Cone, Vector, cone_max, cone_sum
+from ..conic import Cone, Vector, cone_all, cone_any, cone_max, cone_sum
 from ..core import Array, cross_components, frame_components, normalize_components
 from .grasp import Grasp
 from .models import Component
+from .validity import sound_contacts
 
-__all__ = ["Contacts", "Folded", "contacts_of", "fold", "unfold"]
+__all__ = ["Contacts", "Folded", "contacts_of", "fold", "normal_first", "resultant", "unfold"]
 
 
 class Contacts(NamedTuple):
@@ -44,21 +45,12 @@ class Folded(NamedTuple):
 
 
 @stage
-def _screen(
+def _valid_and_live(
     position: tuple[Array, ...], normal: tuple[Array, ...], friction: Array, torsion: Array, active: Array
 ) -> tuple[Array, Array]:
     """Which lanes are grasps, and which of their contacts count; coordinates and coefficients (k, L)."""
-    usable = jnp.isfinite(friction) & jnp.isfinite(torsion) & (friction >= 0) & (torsion >= 0)
-    points = jnp.zeros_like(usable)
-    for x in normal:
-        points = points | (x != 0)
-    for x in (*position, *normal):
-        usable = usable & jnp.isfinite(x)
-    sound = (usable & points) | ~active
-    valid, some = sound[0], active[0]
-    for i in range(1, active.shape[0]):
-        valid, some = valid & sound[i], some | active[i]
-    valid = valid & some
+    sound = sound_contacts(position, normal, friction, torsion) | ~active
+    valid = cone_all(sound) & cone_any(active)
     return valid, active & valid
 
 
@@ -87,7 +79,7 @@ def _spin_column(normal: tuple[Array, ...], factor: Array) -> Array:
 
 
 @stage
-def _resultant(normal_column: Array) -> Vector:
+def resultant(normal_column: Array) -> Vector:
     return tuple(cone_sum(normal_column[i]) for i in range(normal_column.shape[0]))
 
 
@@ -107,18 +99,10 @@ def fold(contacts: Contacts, components: tuple[Component, ...], length: Array | 
 
     ``length`` (L,) is what lengths are divided by, by default the largest distance of a contact from the origin.
     """
-    position, normal = to_lanes(contacts.position), to_lanes(contacts.normal)
-    friction, torsion, active = (
-        to_lanes(contacts.friction),
-        to_lanes(contacts.torsion),
-        to_lanes(contacts.active),
-    )
+    position, normal, friction, torsion, active = (to_lanes(x) for x in contacts)
     dtype, dimension = position.dtype, position.shape[1]
-    coordinates = (
-        tuple(position[:, i] for i in range(dimension)),
-        tuple(normal[:, i] for i in range(dimension)),
-    )
-    valid, live = _screen(*coordinates, friction, torsion, active)
+    coordinates = tuple(tuple(x[:, i] for i in range(dimension)) for x in (position, normal))
+    valid, live = _valid_and_live(*coordinates, friction, torsion, active)
     exists = live.astype(dtype)
     point = tuple(jnp.where(live, position[:, i], jnp.zeros_like(position[:, i])) for i in range(dimension))
     length = _length(point) if length is None else length
@@ -129,11 +113,13 @@ def fold(contacts: Contacts, components: tuple[Component, ...], length: Array | 
 
     mu = jnp.where(live, friction, jnp.zeros_like(friction))
     gamma = jnp.where(live, torsion, jnp.zeros_like(torsion)) / length
-    columns = [_column(point, direction, exists)]
-    for component in components:
-        if component is Component.SPIN:
+    columns = []
+    for component in normal_first(components):
+        if component is Component.NORMAL:
+            columns.append(_column(point, direction, exists))
+        elif component is Component.SPIN:
             columns.append(_spin_column(direction, gamma))
-        elif component is not Component.NORMAL:
+        else:
             columns.append(_column(point, frames[0 if component is Component.TANGENT_1 else 1], mu))
     return Folded(
         tuple(columns),
@@ -142,8 +128,13 @@ def fold(contacts: Contacts, components: tuple[Component, ...], length: Array | 
         length,
         valid,
         _frobenius(tuple(columns)),
-        _resultant(columns[0]),
+        resultant(columns[0]),
     )
+
+
+def normal_first(components: tuple[Component, ...]) -> tuple[Component, ...]:
+    """The order of scaled forces: the normal component, then the others in the chapter's order."""
+    return (Component.NORMAL, *(c for c in components if c is not Component.NORMAL))
 
 
 def contacts_of(grasp: Grasp) -> Contacts:
@@ -159,12 +150,10 @@ def contacts_of(grasp: Grasp) -> Contacts:
 
 def unfold(s: Cone, components: tuple[Component, ...], friction: Array, torsion: Array) -> Array:
     """``f = (mu s_1, mu s_2, s_0, gamma s_3)`` per contact in the chapter's order, flattened to (k n, L)."""
-    tangential = iter(s[1:])
-    parts = []
-    for component in components:
-        if component is Component.NORMAL:
-            parts.append(s[0])
-        else:
-            parts.append((torsion if component is Component.SPIN else friction) * next(tangential))
+    scaled = dict(zip(normal_first(components), s, strict=True))
+    coefficient = {Component.SPIN: torsion}
+    parts = [
+        scaled[c] if c is Component.NORMAL else coefficient.get(c, friction) * scaled[c] for c in components
+    ]
     stacked = jnp.stack(parts, axis=1)
     return stacked.reshape(-1, stacked.shape[-1])

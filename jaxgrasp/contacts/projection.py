@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from ..backend import stage
+from ..backend import stage, to_lanes
 from ..conic import (
     Cholesky,
     Cone,
     Vector,
+    as_vector,
     cone_min,
     cone_sum,
     interior_distance,
@@ -22,15 +23,20 @@ from ..conic import (
     vector_norm,
 )
 from ..core import Array, rank_tolerance, rounding_constant, unit_roundoff
-from .folded import Folded, _resultant
+from .folded import Contacts, Folded, fold, resultant
+from .models import Component
 
 __all__ = [
     "Projection",
+    "Tile",
     "minus_transposed",
     "normalized",
     "onto_null_space",
     "project",
     "smallest_slack",
+    "stored_norm",
+    "tile_of",
+    "to_body",
     "to_twist",
 ]
 
@@ -54,10 +60,39 @@ def project(folded: Folded) -> Projection:
     """Orthonormalise the rows of A; ``sigma >= 1 / |L^-1| - c eps |A|`` allows for rounding in L."""
     dtype = folded.norm.dtype
     columns, factor = orthonormal_rows(folded.columns, rank_tolerance(dtype) * folded.norm)
-    basis = folded._replace(columns=columns, resultant=_resultant(columns[0]))
+    basis = folded._replace(columns=columns, resultant=resultant(columns[0]))
     rounding = rounding_constant() * unit_roundoff(dtype) * folded.norm
     sigma = 1 / jnp.sqrt(inverse_frobenius(factor)) - rounding
     return Projection(basis, factor, jnp.maximum(sigma, jnp.zeros_like(sigma)))
+
+
+class Tile(NamedTuple):
+    """A tile of grasps ready for a program: lanes on the last axis, but for the contacts, which are rows.
+
+    components  of a contact's force, in the chapter's order      dimension  2 or 3
+    """
+
+    contacts: Contacts
+    folded: Folded
+    projection: Projection
+    components: tuple[Component, ...]
+    dimension: int
+
+    @property
+    def coefficients(self) -> tuple[Array, Array]:
+        """mu and gamma (k, L)."""
+        return to_lanes(self.contacts.friction), to_lanes(self.contacts.torsion)
+
+
+def tile_of(contacts: Contacts, components: tuple[Component, ...], dimension: int) -> Tile:
+    """The rows ``contacts``, folded and orthonormalised."""
+    folded = fold(contacts, components)
+    return Tile(contacts, folded, project(folded), components, dimension)
+
+
+def to_body(twist: Vector, length: Array, dimension: int) -> Vector:
+    """(velocity; angular velocity) in m/s and rad/s of a twist of A, whose lengths are over ``length``."""
+    return tuple(x if i < dimension else x / length for i, x in enumerate(twist))
 
 
 def to_twist(projection: Projection, y: Vector) -> Vector:
@@ -67,8 +102,7 @@ def to_twist(projection: Projection, y: Vector) -> Vector:
 
 @stage
 def _applied(columns: Cone, s: Cone) -> Vector:
-    applied = matvec(columns, s)
-    return tuple(applied[i] for i in range(applied.shape[0]))
+    return as_vector(matvec(columns, s))
 
 
 @stage

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ..backend import batched, inlined, kernel, map_tiles, to_lanes, to_rows
-from ..conic import ConvexProgram, Motion, Point, newton_solve
+from ..conic import ConvexConeProgram, ConvexPoint, KKTVector, kkt_solve
 from ..core import Array
 from .folded import Contacts
 
-__all__ = ["kept", "masked", "safe_contacts", "tiled", "tiled_solver", "zero_tangent"]
+__all__ = ["BatchAxes", "filled", "masked", "safe_contacts", "tiled", "tiled_solver", "zero_tangent"]
 
 
 def zero_tangent(x: Array) -> Any:
@@ -24,8 +25,23 @@ def zero_tangent(x: Array) -> Any:
     return np.zeros(x.shape, jax.dtypes.float0)
 
 
-def kept(ok: Array, x: Array, value: Any) -> Array:
-    """Row arrays x with ``value`` in the lanes that are not ``ok``."""
+class BatchAxes(NamedTuple):
+    """The batch axes of a result, in front of its own."""
+
+    axes: tuple[int, ...]
+
+    def flat(self, x: Array) -> Array:
+        """(*batch, ..) to rows (N, ..)."""
+        return x.reshape(math.prod(self.axes), *x.shape[len(self.axes) :])
+
+    def back(self, ok: Array, lanes: Array) -> Array:
+        """(.., N), lanes last, to (*batch, ..); zeros in the lanes that are not ``ok``."""
+        lanes = jnp.where(ok, lanes, jnp.zeros_like(lanes))
+        return to_rows(lanes).reshape(*self.axes, *lanes.shape[:-1])
+
+
+def filled(ok: Array, x: Array, value: Any) -> Array:
+    """Row arrays x, filled with ``value`` in the lanes that are not ``ok``."""
     mask = ok.reshape(*ok.shape, *([1] * (x.ndim - 1)))
     return jnp.where(mask, x, jnp.asarray(value, x.dtype))
 
@@ -34,13 +50,13 @@ def masked(ok: Array, x: Array, dx: Any) -> Any:
     """Tangent rows dx of x, zero in the lanes that are not ``ok``."""
     if not jnp.issubdtype(x.dtype, jnp.floating):
         return dx
-    return kept(ok, dx, 0.0)
+    return filled(ok, dx, 0.0)
 
 
 def safe_contacts(ok: Array, contacts: Contacts) -> Contacts:
     """Harmless numbers in lanes without a derivative and in padding, so that no NaN enters, forwards or backwards."""
     axis = np.eye(contacts.position.shape[-1])[-1]
-    live = kept(ok, contacts.active, True)
+    live = filled(ok, contacts.active, True)
     used = live & ok[:, None]
     point = used[..., None]
     return Contacts(
@@ -71,14 +87,18 @@ def tiled(function: Callable[..., Any], rows: Any, lanes: Any, width: int) -> An
 
 
 def tiled_solver(
-    program_of: Callable[[Any, Any], ConvexProgram], rows: Any, scales: Any, point: Point, width: int
-) -> Callable[[Motion], Motion]:
-    """``newton_solve`` at these points, ``tiled``.
+    program_of: Callable[[Any, Any], ConvexConeProgram],
+    rows: Any,
+    scales: Any,
+    point: ConvexPoint,
+    width: int,
+) -> Callable[[KKTVector], KKTVector]:
+    """``kkt_solve`` at these points, ``tiled``.
 
     ``program_of(rows, scales)`` is the program of A itself; ``scales.factor`` is the factor of A.
     """
 
-    def solve(rows: Any, scales: Any, point: Point, rhs: Motion) -> Motion:
-        return newton_solve(program_of(rows, scales), point, scales.factor, rhs)
+    def solve(rows: Any, scales: Any, point: ConvexPoint, rhs: KKTVector) -> KKTVector:
+        return kkt_solve(program_of(rows, scales), point, scales.factor, rhs)
 
     return lambda rhs: tiled(solve, rows, (scales, point, rhs), width)

@@ -2,6 +2,7 @@
 
 from .answer import Answer
 from .arrays import Array, ArrayLike, Bool, Float, Index, Int, real_array
+from .broadcast import spread
 from .errors import UserError
 from .geometry import (
     applied,
@@ -26,6 +27,7 @@ from .rotations import (
     rotation_between,
     turned,
 )
+from .select import first_of
 from .status import Status
 from .tolerances import (
     balance_tolerance,
@@ -62,6 +64,7 @@ __all__ = [
     "cross",
     "cross_components",
     "edge_tolerance",
+    "first_of",
     "frame_components",
     "gap_floor",
     "identity_orientation",
@@ -82,6 +85,7 @@ __all__ = [
     "rounding_constant",
     "safe_root",
     "skew",
+    "spread",
     "stationary_tolerance",
     "turned",
     "unit_roundoff",

@@ -1,6 +1,7 @@
 """From a solved force problem to its answer with proof: forces, cost, bound, twists, in the caller's units.
 
-Nothing is claimed that was not proven: the cost and its bound (``duality``), or the load's power along a twist.
+Nothing is claimed that was not proven: the cost and its bound (``bounds``), or the load's power along a twist
+(``infeasibility``).
 """
 
 from __future__ import annotations
@@ -9,11 +10,12 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from ..backend import stage, to_lanes
+from ..backend import stage
 from ..conic import (
     Cone,
-    ConvexProgram,
-    Point,
+    ConvexConeProgram,
+    ConvexPoint,
+    ConvexState,
     Vector,
     as_vector,
     cone_max,
@@ -22,13 +24,13 @@ from ..conic import (
     interior_distance,
     matvec,
     rmatvec,
-    tail_norm,
     vector_norm,
 )
-from ..contacts import Component, Contacts, Folded, Projection, to_twist, unfold
-from ..core import Array, Status, edge_tolerance, proven_limit, rounding_constant, unit_roundoff
+from ..contacts import to_body, to_twist, unfold
+from ..core import Array, Status, edge_tolerance, first_of, proven_limit, unit_roundoff
 from .bounds import criterion_value, dual_value
-from .problem import Balance, Demand, Load
+from .infeasibility import proven_separation
+from .problem import ForceProblem, Load
 
 __all__ = ["Answer", "answer"]
 
@@ -45,6 +47,43 @@ class Answer(NamedTuple):
     joint_rates: Array
 
 
+class Values(NamedTuple):
+    """A criterion between its bound and its cost (L,), in the caller's units.
+
+    scale  the objective, what the gap is relative to      rounding   what evaluating the bound can lose
+    """
+
+    cost: Array
+    bound: Array
+    scale: Array
+    rounding: Array
+
+
+class Proofs(NamedTuple):
+    """Positive where they prove INFEASIBLE: along the solver's ray, and along the twist out of the range of A."""
+
+    ray: Array
+    off: Array
+
+
+class Lanes(NamedTuple):
+    """What is known of the lanes before the answer (L,): a problem, off the range of A, at rest; why it stopped."""
+
+    valid: Array
+    off: Array
+    rest: Array
+    stop: Array
+
+
+class Multipliers(NamedTuple):
+    """Multipliers (m + q, L) of the optimum and of the proof of infeasibility, and the twists of A they stand for."""
+
+    rows: Array
+    ray: Array
+    twist: Vector
+    escape: Vector
+
+
 @stage
 def _polished(basis: Cone, rhs: Array, exists: Array, u: Cone) -> Cone:
     """The nearest point with ``Q u = b``, twice, so that what is left is rounding."""
@@ -56,7 +95,7 @@ def _polished(basis: Cone, rhs: Array, exists: Array, u: Cone) -> Cone:
 
 
 @stage
-def _shortfall(program: ConvexProgram, u: Cone) -> Array:
+def _violation(program: ConvexConeProgram, u: Cone) -> Array:
     """How far u is outside the cones, the caps, the bounds, relative to the largest force; 0 inside (L,)."""
     exists = program.exists
     largest = cone_max(exists * jnp.abs(u[0]))
@@ -71,111 +110,76 @@ def _shortfall(program: ConvexProgram, u: Cone) -> Array:
 
 
 @stage
-def _statuses(
-    smoothing: Array | None, valid: Array, off: Array, rest: Array, stop: Array, short: Array,
-    cost: Array, bound: Array, scale: Array, tolerance: Array, proof: Array, off_proof: Array, fine: float,
+def _status(
+    lanes: Lanes, values: Values, proofs: Proofs, violation: Array, smoothing: Array | None,
+    tolerance: Array, edge: float,
 ) -> Array:  # fmt: skip
-    def choose(status: Status, where: Array, otherwise: Array) -> Array:
-        return jnp.where(where, jnp.int32(status.value), otherwise)
-
-    met = short <= fine
-    tight = (cost - bound) <= tolerance * jnp.maximum(scale, jnp.abs(cost))
+    cost, bound = values.cost, values.bound - values.rounding
+    tight = (cost - bound) <= tolerance * jnp.maximum(values.scale, jnp.abs(cost))
     if smoothing is not None:  # the answer is a point of the central path, at a gap of its own
-        tight = stop == Status.CONVERGED.value
+        tight = lanes.stop == Status.CONVERGED.value
     finite = jnp.isfinite(cost) & jnp.isfinite(bound)
-    status = jnp.full(cost.shape, Status.STALLED.value, jnp.int32)
-    status = choose(Status.INFEASIBLE, proof > 0, status)
-    status = choose(Status.OPTIMAL, met & tight & finite & (stop != Status.SKIPPED.value), status)
-    status = choose(Status.OPTIMAL, rest, status)
-    status = choose(Status.STALLED, off, status)
-    status = choose(Status.INFEASIBLE, off & (off_proof > 0), status)
-    return choose(Status.INVALID, ~valid, status)
+    optimal = (violation <= edge) & tight & finite & (lanes.stop != Status.SKIPPED.value)
+    return first_of(
+        [
+            (~lanes.valid, Status.INVALID),
+            (lanes.off & (proofs.off > 0), Status.INFEASIBLE),
+            (lanes.off, Status.STALLED),
+            (lanes.rest, Status.OPTIMAL),
+            (optimal, Status.OPTIMAL),
+            (proofs.ray > 0, Status.INFEASIBLE),
+        ],
+        Status.STALLED,
+    )
 
 
-@stage
-def _power_left(
-    folded: Folded, program: ConvexProgram, twist: Vector, beta: Array | None, load: Load, limit: float
-) -> Array:
-    """Power of the load along ``twist`` less what forces up to ``limit`` loads and the torques can take up, on A.
-
-    Allows twice for the rounding the checker allows for, in its float64.
-    """
-    rounding = rounding_constant() * unit_roundoff("float64")
-    x, blur = rmatvec(folded.columns, twist), folded.norm * vector_norm(twist)
-    if beta is not None:
-        joints = tuple(c[program.rhs.shape[0] :] for c in program.columns)
-        x = tuple(a + b for a, b in zip(x, rmatvec(joints, as_vector(beta)), strict=True))
-        blur = blur + vector_norm(as_vector(beta))
-    short = program.exists * jnp.maximum(tail_norm(x) - x[0] + rounding * blur, jnp.zeros_like(x[0]))
-    outer = vector_norm(load.wrench)
-    most = jnp.broadcast_to(limit * outer, short.shape)
-    if program.cap is not None:
-        most = jnp.minimum(most, program.cap * load.size)
-    taken = cone_sum(short * most)
-    if beta is not None:
-        for j in range(beta.shape[0]):
-            taken = taken + jnp.abs(beta[j]) * program.bound[j] * load.size
-    power = twist[0] * load.wrench[0]
-    for a, b in zip(twist[1:], load.wrench[1:], strict=True):
-        power = power + a * b
-    return power - rounding * vector_norm(twist) * outer - taken
-
-
-def answer(
-    contacts: Contacts,
-    folded: Folded,
-    projection: Projection,
-    problem: Balance,
-    demand: Demand,
-    point: Point,
-    ray: Array,
-    stop: Array,
-    tolerance: Array,
-    components: tuple[Component, ...],
-    dimension: int,
-) -> Answer:
+def answer(problem: ForceProblem, state: ConvexState, tolerance: Array) -> Answer:
     """Read one tile's answers off its points. Nothing is claimed that was not proven."""
-    program, load = problem.program, problem.load
-    dtype = folded.norm.dtype
-    m = program.rhs.shape[0]
-    u = _polished(projection.basis.columns, program.rhs, program.exists, point.u)
-    weight = demand.criterion.barrier_weight
-    terms = None
-    if demand.log_det is not None:
-        on_normal, on_cone, constant = (to_lanes(x) for x in demand.log_det)
-        terms = (on_normal, on_cone, constant)
-    cost = criterion_value(program, u, load.size, weight, terms)
+    program, load, projection = problem.program, problem.load, problem.tile.projection
+    m, dtype = program.rhs.shape[0], problem.tile.folded.norm.dtype
+    u = _polished(projection.basis.columns, program.rhs, program.exists, state.point.u)
+    rows, ray = _all_rows(state.point), state.ray
+    values = _values(problem, state.point, u, rows)
 
-    rows = _all_rows(point)
-    bound = dual_value(program, rows, u, load.size, weight, terms)
+    found = Multipliers(
+        rows, ray, to_twist(projection, as_vector(rows[:m])), to_twist(projection, as_vector(ray[:m]))
+    )
+    load = load._replace(rest=load.rest & (problem.demand.criterion.barrier_weight is None))
+    status = _status(
+        Lanes(problem.valid, load.off, load.rest, state.stop),
+        values,
+        _proofs(problem, found),
+        _violation(program, u),
+        program.smoothing,
+        tolerance,
+        edge_tolerance(dtype),
+    )
+    return _in_user_units(problem._replace(load=load), status, u, values, found)
+
+
+def _values(problem: ForceProblem, point: ConvexPoint, u: Cone, rows: Array) -> Values:
+    program, size, barrier = problem.program, problem.load.size, problem.demand.barrier()
+    cost = criterion_value(program, u, size, barrier)
+    bound = dual_value(program, rows, u, size, barrier)
     bound = jnp.where(jnp.isnan(bound), -jnp.inf, bound)
-    scale = _scale(program, point, load.size)
-    blur = _blur(program, rows, u, load.size)
-    short = _shortfall(program, u)
-    limit = proven_limit(dtype)
-    escape = to_twist(projection, as_vector(ray[:m]))
-    proof = _power_left(folded, program, escape, None if program.bound is None else ray[m:], load, limit)
-    off_proof = _power_left(folded, program, load.twist, None, load, limit)
-    status = _statuses(
-        program.smoothing, problem.valid, load.off, load.rest & (weight is None), stop, short, cost, bound - blur,
-        scale, tolerance, proof, off_proof, edge_tolerance(dtype),
-    )  # fmt: skip
+    return Values(cost, bound, _scale(program, point, size), _rounding(program, rows, u, size))
 
-    multiplier = to_twist(projection, as_vector(rows[:m]))
-    load = load._replace(rest=load.rest & (weight is None))
-    return _read_back(
-        status, u, cost, bound, escape, multiplier, rows, ray, folded, load, problem.row_norm, contacts,
-         components, dimension, program.curvature is not None,
-    )  # fmt: skip
+
+def _proofs(problem: ForceProblem, found: Multipliers) -> Proofs:
+    folded, program, load = problem.tile.folded, problem.program, problem.load
+    limit = proven_limit(folded.norm.dtype)
+    rates = None if program.bound is None else found.ray[program.rhs.shape[0] :]
+    ray = proven_separation(folded, program, found.escape, rates, load, limit)
+    return Proofs(ray, proven_separation(folded, program, load.twist, None, load, limit))
 
 
 @stage
-def _all_rows(point: Point) -> Array:
+def _all_rows(point: ConvexPoint) -> Array:
     return point.rows()
 
 
 @stage
-def _blur(program: ConvexProgram, rows: Array, u: Cone, size: Array) -> Array:
+def _rounding(program: ConvexConeProgram, rows: Array, u: Cone, size: Array) -> Array:
     """What rounding can do to the bound of multipliers as large as ``rows``."""
     forces = jnp.sqrt(cone_sum(program.exists * inner(u, u)))
     blur = vector_norm(as_vector(rows)) * (vector_norm(as_vector(program.rhs)) + forces) * size
@@ -184,54 +188,50 @@ def _blur(program: ConvexProgram, rows: Array, u: Cone, size: Array) -> Array:
 
 
 @stage
-def _scale(program: ConvexProgram, point: Point, size: Array) -> Array:
+def _scale(program: ConvexConeProgram, point: ConvexPoint, size: Array) -> Array:
     value = program.size(point) * size
     return value * size if program.curvature is not None else value
 
 
-def _read_back(
-    status, u, cost, bound, escape, multiplier, rows, ray, folded, load, row_norm, contacts,
-    components, dimension: int, squared: bool,
-) -> Answer:  # fmt: skip
+def _in_user_units(
+    problem: ForceProblem, status: Array, u: Cone, values: Values, found: Multipliers
+) -> Answer:
     """Newtons and metres; zeros, infinities and NaN where the status says so."""
+    tile, squared = problem.tile, problem.program.curvature is not None
 
     @stage
     def run(
-        status, u, cost, bound, escape, multiplier, rows, ray, length, load, row_norm, friction, torsion
-    ) -> tuple[Array, ...]:
+        status: Array, u: Cone, values: Values, found: Multipliers, load: Load, length: Array,
+        row_norm: Array | None, coefficients: tuple[Array, Array],
+    ) -> tuple[Array, ...]:  # fmt: skip
         optimal, infeasible = status == Status.OPTIMAL.value, status == Status.INFEASIBLE.value
-        invalid, rest = status == Status.INVALID.value, load.rest
-        m = len(multiplier)
+        invalid, cost, bound = status == Status.INVALID.value, values.cost, values.bound
+        m = len(found.twist)
         nan, inf = jnp.full_like(cost, jnp.nan), jnp.full_like(cost, jnp.inf)
         zero = jnp.zeros_like(cost)
 
         def final(x: Array, none: Array, where: Array) -> Array:
             return jnp.where(invalid, nan, jnp.where(where, none, x))
 
-        resting = rest & optimal & (bound <= zero)
-        force = unfold(tuple(load.size * x for x in u), components, friction, torsion)
-        blank = infeasible | resting
-        force = final(force, zero, blank)
+        resting = load.rest & optimal & (bound <= zero)
+        force = unfold(tuple(load.size * x for x in u), tile.components, *coefficients)
+        force = final(force, zero, infeasible | resting)
         cost = final(jnp.where(resting, zero, cost), inf, infeasible)
         bound = final(jnp.where(resting, zero, bound), inf, infeasible)
         bound = jnp.where(bound < cost, bound, cost)
-        off = load.off
-        escape = tuple(jnp.where(off, a, b) for a, b in zip(load.twist, escape, strict=True))
-        escape = tuple(x if i < dimension else x / length for i, x in enumerate(escape))
+        escape = tuple(jnp.where(load.off, a, b) for a, b in zip(load.twist, found.escape, strict=True))
+        escape = to_body(escape, length, tile.dimension)
         size = vector_norm(escape)
         size = jnp.where((size > 0) & jnp.isfinite(size), size, jnp.ones_like(size))
         escape = jnp.stack([final(jnp.where(infeasible, x / size, zero), zero, zero > 1) for x in escape])
         back = load.size if squared else jnp.ones_like(load.size)
-        multiplier = [back * (x if i < dimension else x / length) for i, x in enumerate(multiplier)]
-        twist = jnp.stack([final(x, zero, infeasible | resting) for x in multiplier])
+        twist = tuple(back * x for x in to_body(found.twist, length, tile.dimension))
+        twist = jnp.stack([final(x, zero, infeasible | resting) for x in twist])
         rates = jnp.zeros((0, *cost.shape), cost.dtype)
         if row_norm is not None:
-            beta = jnp.where(infeasible, ray[m:] / size, back * rows[m:]) / row_norm
-            rates = final(beta, zero, resting | (off & infeasible))
+            beta = jnp.where(infeasible, found.ray[m:] / size, back * found.rows[m:]) / row_norm
+            rates = final(beta, zero, resting | (load.off & infeasible))
         return force, cost, bound, escape, twist, rates
 
-    values = run(
-        status, u, cost, bound, escape, multiplier, rows, ray, folded.length, load, row_norm,
-        to_lanes(contacts.friction), to_lanes(contacts.torsion),
-    )  # fmt: skip
-    return Answer(status, *values)
+    length, row_norm = tile.folded.length, problem.row_norm
+    return Answer(status, *run(status, u, values, found, problem.load, length, row_norm, tile.coefficients))

@@ -1,7 +1,7 @@
 """Both sides of the duality gap of force optimisation: a criterion at forces, its lower bound at multipliers.
 
 The bound is the dual function in closed form for every criterion, so it holds whatever the solver did.
-``certificate.forces`` evaluates the same formulas again from the answer alone.
+``certificates.forces`` evaluates the same formulas again from the answer alone.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from ..backend import stage
 from ..conic import (
     Cone,
-    ConvexProgram,
+    ConvexConeProgram,
     Curvature,
     as_vector,
     cone_max,
@@ -29,13 +29,25 @@ from ..core import Array
 __all__ = ["criterion_value", "dual_value"]
 
 
+class Barrier(NamedTuple):
+    """``weight * sum_i log det P_i``, with ``log det P = on_normal log f_n + on_cone log(f_n^2 - psi^2) + constant``.
+
+    weight (L,); the others (k, L).
+    """
+
+    weight: Array
+    on_normal: Array
+    on_cone: Array
+    constant: Array
+
+
 def _top(exists: Array, u: Cone) -> Array:
     return cone_max(jnp.where(exists > 0, u[0], jnp.full_like(u[0], -jnp.inf)))
 
 
-def _logs(weight: Array, terms: tuple[Array, Array, Array], exists: Array, u: Cone, size: Array) -> Array:
+def _log_det(barrier: Barrier, exists: Array, u: Cone, size: Array) -> Array:
     """``weight * sum log det P`` of the forces ``size u``; -inf where one is not inside its cone."""
-    on_normal, on_cone, constant = terms
+    weight, on_normal, on_cone, constant = barrier
     one = jnp.ones_like(u[0])
     det = jnp.where((exists > 0) & (on_cone > 0), size * size * determinant(u), one)
     head = jnp.where(exists > 0, size * u[0], one)
@@ -46,11 +58,10 @@ def _logs(weight: Array, terms: tuple[Array, Array, Array], exists: Array, u: Co
 
 @stage
 def criterion_value(
-    program: ConvexProgram,
+    program: ConvexConeProgram,
     u: Cone,
     size: Array,
-    weight: Array | None,
-    terms: tuple[Array, Array, Array] | None,
+    barrier: Barrier | None,
 ) -> Array:
     """The criterion at the forces ``size u``."""
     if program.price is not None:
@@ -58,20 +69,20 @@ def criterion_value(
     if program.curvature is not None:
         return size * size * cone_sum(program.exists * inner(u, program.curvature.apply(u))) / 2
     top = size * _top(program.exists, u)
-    if weight is None or terms is None:
+    if barrier is None:
         return top
-    return top - _logs(weight, terms, program.exists, u, size)
+    return top - _log_det(barrier, program.exists, u, size)
 
 
-class Pull(NamedTuple):
-    """x = A^T y + E^T beta per cone, and ``y.w - |beta|.bound`` (L,)."""
+class DualPoint(NamedTuple):
+    """x = A^T y + E^T beta per cone, and the linear part of the dual function, ``y.w - |beta|.bound`` (L,)."""
 
     x: Cone
     gain: Array
 
 
 @stage
-def _pull(program: ConvexProgram, rows: Array) -> Pull:
+def _dual_point(program: ConvexConeProgram, rows: Array) -> DualPoint:
     m = program.rhs.shape[0]
     gain = -program.rhs[0] * rows[0]
     for i in range(1, m):
@@ -79,12 +90,12 @@ def _pull(program: ConvexProgram, rows: Array) -> Pull:
     if program.bound is not None:
         for j in range(program.bound.shape[0]):
             gain = gain - jnp.abs(rows[m + j]) * program.bound[j]
-    return Pull(rmatvec(program.columns, as_vector(rows)), gain)
+    return DualPoint(rmatvec(program.columns, as_vector(rows)), gain)
 
 
-def _covered(short: Array, cap: Array | None, total: Array) -> Array:
-    """The part of ``short`` (k, L) that multipliers of sum ``total`` should cover: the dearest caps first."""
-    k = short.shape[0]
+def _level_multipliers(violation: Array, cap: Array | None, total: Array) -> Array:
+    """Multipliers of the level, of sum ``total``, that cover most of ``violation`` (k, L): the dearest caps first."""
+    k = violation.shape[0]
     rows = []
     for i in range(k):
         before = jnp.zeros_like(total)
@@ -93,61 +104,61 @@ def _covered(short: Array, cap: Array | None, total: Array) -> Array:
                 continue
             if cap is None:
                 first = j < i
-                before = before + (short[j] if first else jnp.zeros_like(total))
+                before = before + (violation[j] if first else jnp.zeros_like(total))
             else:
                 first = (cap[j] > cap[i]) | ((cap[j] == cap[i]) & (j < i))
-                before = before + jnp.where(first, short[j], jnp.zeros_like(total))
-        left = jnp.maximum(total - before, jnp.zeros_like(total))
-        rows.append(jnp.minimum(left, short[i]))
+                before = before + jnp.where(first, violation[j], jnp.zeros_like(total))
+        remaining = jnp.maximum(total - before, jnp.zeros_like(total))
+        rows.append(jnp.minimum(remaining, violation[i]))
     return jnp.stack(rows)
 
 
 @stage
-def _linear_bound(program: ConvexProgram, pull: Pull) -> Array:
+def _linear_bound(program: ConvexConeProgram, dual: DualPoint) -> Array:
     """Dual value of prices and levels: the twist as it is, paying caps, or scaled to need none."""
-    exists, x = program.exists, pull.x
+    exists, x = program.exists, dual.x
     zero = jnp.zeros_like(exists)
-    short = exists * jnp.maximum(tail_norm(x) - x[0], zero)
+    violation = exists * jnp.maximum(tail_norm(x) - x[0], zero)
     if program.price is not None:
-        covered = jnp.minimum(short, program.price)
-        largest = cone_max(short)
+        covered = jnp.minimum(violation, program.price)
+        largest = cone_max(violation)
     else:
-        covered = _covered(short, program.cap, jnp.ones_like(short[0]))
-        largest = cone_sum(short)
+        covered = _level_multipliers(violation, program.cap, jnp.ones_like(violation[0]))
+        largest = cone_sum(violation)
     needed = jnp.where(largest > 0, largest, jnp.ones_like(largest))
-    scaled = jnp.where(largest > 0, pull.gain / needed, jnp.zeros_like(largest))
-    over = short - covered
+    scaled = jnp.where(largest > 0, dual.gain / needed, jnp.zeros_like(largest))
+    over = violation - covered
     cap = jnp.full_like(over, jnp.inf) if program.cap is None else program.cap
     paid = cone_sum(jnp.where(over > 0, over * cap, zero))
-    return jnp.maximum(jnp.maximum(scaled, pull.gain - paid), jnp.zeros_like(scaled))
+    return jnp.maximum(jnp.maximum(scaled, dual.gain - paid), jnp.zeros_like(scaled))
 
 
 @stage
-def _quadratic_bound(program: ConvexProgram, pull: Pull, u: Cone) -> Array:
+def _quadratic_bound(program: ConvexConeProgram, dual: DualPoint, u: Cone) -> Array:
     """Dual value with the tails' cost linearised at u, which convexity allows; s_0 minimised exactly in [0, cap]."""
     curvature: Curvature | None = program.curvature
     assert curvature is not None
     exists = program.exists
-    pushed = curvature.apply(u)
-    x = (pull.x[0], *(a + b for a, b in zip(pull.x[1:], pushed[1:], strict=True)))
-    spent = inner(u, pushed) - u[0] * pushed[0]
+    tangent = curvature.apply(u)
+    x = (dual.x[0], *(a + b for a, b in zip(dual.x[1:], tangent[1:], strict=True)))
+    spent = inner(u, tangent) - u[0] * tangent[0]
     rho = jnp.maximum(tail_norm(x) - x[0], jnp.zeros_like(x[0]))
     flat = jnp.where(exists > 0, curvature.head, jnp.ones_like(exists))
     best = rho / flat
     if program.cap is not None:
         best = jnp.minimum(best, program.cap)
-    return pull.gain + cone_sum(exists * (flat * best * best / 2 - rho * best - spent / 2))
+    return dual.gain + cone_sum(exists * (flat * best * best / 2 - rho * best - spent / 2))
 
 
 @stage
-def _barrier_bound(program: ConvexProgram, pull: Pull, u: Cone) -> Array:
+def _barrier_bound(program: ConvexConeProgram, dual: DualPoint, u: Cone) -> Array:
     """Dual value of the fixed barriers: ``sum phi - phi log phi + phi/2 log det z + psi - psi log psi + psi log p``.
 
     Where u_0 is at its level, ``phi z_0 / det z = psi / p = level`` fixes z_0 and p; elsewhere p is that of the forces.
     The level's multipliers, of sum 1, supply what z lacks, the dearest caps first; what is left is
     worth most at the largest u_0.
     """
-    exists, x = program.exists, pull.x
+    exists, x = program.exists, dual.x
     phi, psi = program.cone_floor, program.head_floor
     assert phi is not None and psi is not None
     zero, one = jnp.zeros_like(exists), jnp.ones_like(exists)
@@ -159,7 +170,7 @@ def _barrier_bound(program: ConvexProgram, pull: Pull, u: Cone) -> Array:
     wanted = jnp.where(phi > 0, (phi + jnp.sqrt(phi * phi + (2 * level * tail) ** 2)) / (2 * level), tail)
     needed = exists * jnp.maximum(wanted + psi / level - x[0], zero)
     price = exists * psi / jnp.where((exists > 0) & (needed <= 0), u[0], level)
-    share = _covered(needed, program.cap, one[0])
+    share = _level_multipliers(needed, program.cap, one[0])
     paid, over = jnp.zeros_like(one[0]), zero
     if program.cap is not None:
         finite = jnp.isfinite(program.cap) & (exists > 0)
@@ -173,7 +184,7 @@ def _barrier_bound(program: ConvexProgram, pull: Pull, u: Cone) -> Array:
     z = (jnp.where(exists > 0, head, one), *(exists * v for v in x[1:]))
     det = jnp.where(interior_distance(z) > 0, determinant(z), zero)
     value = _conjugate(phi, det, 0.5) + _conjugate(psi, price, 1.0)
-    return pull.gain - paid + cone_sum(jnp.where(exists > 0, value, zero))
+    return dual.gain - paid + cone_sum(jnp.where(exists > 0, value, zero))
 
 
 def _conjugate(floor: Array, value: Array, power: float) -> Array:
@@ -185,33 +196,30 @@ def _conjugate(floor: Array, value: Array, power: float) -> Array:
 
 
 @stage
-def _shifted(
-    bound: Array, weight: Array, terms: tuple[Array, Array, Array], exists: Array, size: Array
-) -> Array:
+def _unscaled(bound: Array, barrier: Barrier, exists: Array, size: Array) -> Array:
     """Back from forces u to forces ``size u`` under the logarithms."""
-    on_normal, on_cone, constant = terms
+    weight, on_normal, on_cone, constant = barrier
     log = jnp.log(size)
     return size * bound - weight * cone_sum(exists * ((on_normal + 2 * on_cone) * log + constant))
 
 
 def dual_value(
-    program: ConvexProgram,
+    program: ConvexConeProgram,
     rows: Array,
     u: Cone,
     size: Array,
-    weight: Array | None,
-    terms: tuple[Array, Array, Array] | None,
+    barrier: Barrier | None,
 ) -> Array:
     """What no admissible forces can undercut, from the multipliers ``rows``; u near the optimum makes it close."""
-    pull = _pull(program, rows)
+    dual = _dual_point(program, rows)
     if program.curvature is not None:
-        return _by(_by(_quadratic_bound(program, pull, u), size), size)
+        return _scaled(_scaled(_quadratic_bound(program, dual, u), size), size)
     if program.head_floor is None:
-        return _by(_linear_bound(program, pull), size)
-    assert weight is not None and terms is not None
-    return _shifted(_barrier_bound(program, pull, u), weight, terms, program.exists, size)
+        return _scaled(_linear_bound(program, dual), size)
+    assert barrier is not None
+    return _unscaled(_barrier_bound(program, dual, u), barrier, program.exists, size)
 
 
 @stage
-def _by(x: Array, size: Array) -> Array:
+def _scaled(x: Array, size: Array) -> Array:
     return x * size

@@ -1,4 +1,4 @@
-"""What is asked of each grasp, spread over all problems: loads, limits and weights for one, some or all of them."""
+"""What is asked of each grasp, spread over all problems: loads, limits and weights."""
 
 from __future__ import annotations
 

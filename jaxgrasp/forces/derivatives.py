@@ -11,23 +11,32 @@ derivative 0.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ..backend import inlined, to_lanes, to_rows
-from ..conic import Cholesky, Cone, ConvexProgram, Point, cone_sum, lagrangian, point_tangent, residuals
+from ..backend import inlined, to_lanes
+from ..conic import (
+    Cholesky,
+    Cone,
+    ConvexConeProgram,
+    ConvexPoint,
+    cone_sum,
+    lagrangian,
+    point_tangent,
+    residuals,
+)
 from ..contacts import (
+    BatchAxes,
     Component,
     Contacts,
+    filled,
     fold,
-    kept,
     masked,
     safe_contacts,
     tiled_solver,
@@ -37,7 +46,7 @@ from ..contacts import (
 from ..core import Array, Status
 from .answer import Answer
 from .bounds import criterion_value
-from .problem import Demand, cone_program
+from .problem import Demand, force_program
 
 __all__ = ["Scales", "Solved", "differentiable"]
 
@@ -63,7 +72,7 @@ class Solved(NamedTuple):
     smooth: Array
     iterations: Array
     stop: Array
-    point: Point | None
+    point: ConvexPoint | None
     scales: Scales | None
 
 
@@ -75,14 +84,14 @@ class _Form(NamedTuple):
     width: int
 
 
-def _program(form: _Form, rows: Rows, scales: Scales) -> ConvexProgram:
+def _program(form: _Form, rows: Rows, scales: Scales) -> ConvexConeProgram:
     """The scaled program ``A u = -w / size`` as a differentiable function of the data."""
     contacts, demand = rows
     folded = fold(contacts, form.components, scales.length)
     wrench = to_lanes(demand.wrench)
     force, torque = wrench[: form.dimension], wrench[form.dimension :] / scales.length
     rhs = -jnp.concatenate([force, torque]) / scales.size
-    program, _, _ = cone_program(
+    program, _, _ = force_program(
         contacts, folded.exists, folded.columns, rhs, scales.size, demand, form.components, scales.row_norm
     )
     return program
@@ -93,12 +102,12 @@ def _safe(ok: Array, rows: Rows) -> Rows:
     contacts, demand = rows
 
     def keep(x: Array | None, value: float) -> Array | None:
-        return None if x is None else kept(ok, x, value)
+        return None if x is None else filled(ok, x, value)
 
     asked = Demand(
-        kept(ok, demand.wrench, 0.0),
-        jax.tree.map(lambda x: kept(ok, x, 1.0), demand.criterion),
-        jax.tree.map(lambda x: kept(ok, x, 1.0), demand.log_det),
+        filled(ok, demand.wrench, 0.0),
+        jax.tree.map(lambda x: filled(ok, x, 1.0), demand.criterion),
+        jax.tree.map(lambda x: filled(ok, x, 1.0), demand.log_det),
         keep(demand.cap, np.inf),
         keep(demand.jacobian, 0.0),
         keep(demand.torque, 1.0),
@@ -107,7 +116,7 @@ def _safe(ok: Array, rows: Rows) -> Rows:
     return safe_contacts(ok, contacts), asked
 
 
-def _safe_point(ok: Array, point: Point) -> Point:
+def _safe_point(ok: Array, point: ConvexPoint) -> ConvexPoint:
     """An interior point in the lanes without a derivative; lanes last."""
 
     def keep(x: Array, value: float) -> Array:
@@ -118,7 +127,7 @@ def _safe_point(ok: Array, point: Point) -> Point:
 
     ones = jax.tree.map(lambda x: keep(x, 1.0), (point.slack, point.price))
     xi = None if point.xi is None else keep(point.xi, 2.0)
-    return Point(keep(point.y, 0.0), xi, cone(point.u), cone(point.z), *ones)
+    return ConvexPoint(keep(point.y, 0.0), xi, cone(point.u), cone(point.z), *ones)
 
 
 class _View(NamedTuple):
@@ -130,7 +139,7 @@ class _View(NamedTuple):
     cost: Array
 
 
-def _view(form: _Form, rows: Rows, scales: Scales, point: Point) -> _View:
+def _view(form: _Form, rows: Rows, scales: Scales, point: ConvexPoint) -> _View:
     """Forces, multipliers and the criterion's value, as functions of the data and the point."""
     contacts, demand = rows
     friction, torsion = to_lanes(contacts.friction), to_lanes(contacts.torsion)
@@ -143,24 +152,22 @@ def _view(form: _Form, rows: Rows, scales: Scales, point: Point) -> _View:
     if scales.row_norm is not None:
         assert point.price.upper is not None and point.price.lower is not None
         rates = back * (point.price.upper - point.price.lower) / scales.row_norm
-    weight = demand.criterion.barrier_weight
-    terms = None if demand.log_det is None else tuple(to_lanes(x) for x in demand.log_det)
-    cost = criterion_value(program, point.u, scales.size, weight, terms)
+    cost = criterion_value(program, point.u, scales.size, demand.barrier())
     return _View(force, twist, rates, cost)
 
 
-def _value(form: _Form, rows: Rows, scales: Scales, point: Point) -> Array:
+def _value(form: _Form, rows: Rows, scales: Scales, point: ConvexPoint) -> Array:
     """The Lagrangian in the caller's units, the point fixed."""
     demand = rows[1]
     program = _program(form, rows, scales)
     total = scales.size * lagrangian(program, point)
     if program.curvature is not None:
         total = total * scales.size
-    weight = demand.criterion.barrier_weight
-    if weight is not None and demand.log_det is not None:
-        a, b, c = (to_lanes(x) for x in demand.log_det)
-        logs = cone_sum(program.exists * ((a + 2 * b) * jnp.log(scales.size) + c))
-        total = total - weight * logs
+    barrier = demand.barrier()
+    if barrier is not None:
+        degree = barrier.on_normal + 2 * barrier.on_cone
+        logs = cone_sum(program.exists * (degree * jnp.log(scales.size) + barrier.constant))
+        total = total - barrier.weight * logs
     return total
 
 
@@ -186,12 +193,8 @@ def differentiable(
 
 
 def _tangents(form: _Form, result: Solved, rows: Rows, change: Rows) -> Solved:
-    batch = result.answer.status.shape
-    count = math.prod(batch)
-
-    def flat(x: Any) -> Any:
-        return x.reshape(count, *x.shape[len(batch) :])
-
+    batch = BatchAxes(result.answer.status.shape)
+    flat = batch.flat
     data, changes = jax.tree.map(flat, (rows, change))
     assert result.point is not None and result.scales is not None
     status, stop = flat(result.answer.status), flat(result.stop)
@@ -212,10 +215,7 @@ def _tangents(form: _Form, result: Solved, rows: Rows, change: Rows) -> Solved:
     if data[1].smoothing is None:
         _, cost = jax.jvp(lambda r: _value(form, r, scales, point), (data,), (changes,))
 
-    def back(x: Array) -> Array:
-        x = jnp.where(ok, x, jnp.zeros_like(x))
-        return to_rows(x).reshape(*batch, *x.shape[:-1])
-
+    back = partial(batch.back, ok)
     zero = jax.tree.map(zero_tangent, result)
     cost = back(cost)
     answer_change = zero.answer._replace(

@@ -9,6 +9,7 @@ of A that depend on others drop out; a load outside their range is refuted by li
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import NamedTuple
 
 import equinox as eqx
@@ -16,28 +17,21 @@ import jax.numpy as jnp
 
 from ..backend import stage, to_lanes
 from ..conic import (
-    Bounds,
     Cone,
-    ConvexProgram,
+    ConvexConeProgram,
     Curvature,
-    Point,
     Vector,
     as_vector,
-    cone_max,
-    cone_sum,
     null_combination,
-    rmatvec,
     solve_lower,
-    tail_norm,
     vector_norm,
 )
-from ..contacts import Component, Contacts, Folded, Projection
+from ..contacts import Component, Contacts, Tile, normal_first
 from ..core import Array, unit_roundoff
+from .bounds import Barrier
 from .criteria import Criterion
 
-__all__ = ["Balance", "Demand", "Load", "balance", "starting_point"]
-
-FORCE_LIMIT = 1e9  # loads: forces up to this many must be ruled out before infeasible counts as proven
+__all__ = ["Demand", "ForceProblem", "Load", "force_problem", "force_program"]
 
 
 class Demand(NamedTuple):
@@ -57,6 +51,13 @@ class Demand(NamedTuple):
     torque: Array | None
     smoothing: Array | None = None
 
+    def barrier(self) -> Barrier | None:
+        """The criterion's fixed barrier, lanes last."""
+        weight = self.criterion.barrier_weight
+        if weight is None or self.log_det is None:
+            return None
+        return Barrier(weight, *(to_lanes(x) for x in self.log_det))
+
 
 class Load(NamedTuple):
     """The load of a tile in the metric of A.
@@ -75,13 +76,15 @@ class Load(NamedTuple):
     rest: Array
 
 
-class Balance(NamedTuple):
-    """A tile's force problem, scaled, and how to read it back.
+class ForceProblem(NamedTuple):
+    """A tile's force problem: as asked, as the scaled program, and how to read that back.
 
     valid  (L,) bool: the numbers are a problem      row_norm  (q, L): E is divided by it, or None
     """
 
-    program: ConvexProgram
+    tile: Tile
+    demand: Demand
+    program: ConvexConeProgram
     load: Load
     valid: Array
     row_norm: Array | None
@@ -99,28 +102,28 @@ def _scaled_wrench(force: Array, torque: Array, length: Array) -> tuple[Array, A
 
 @stage
 def _load_size(
-    inner: Vector, left: Vector, wrench: Vector, norm: Array, weight: Array | None
+    inner: Vector, residual: Vector, wrench: Vector, norm: Array, weight: Array | None
 ) -> tuple[Array, Array, Array, Array]:
     """b, the size, whether the load is off the range, whether there is none."""
     dtype = norm.dtype
-    size, leftover, outer = vector_norm(inner), vector_norm(left), vector_norm(wrench)
+    size, outside, outer = vector_norm(inner), vector_norm(residual), vector_norm(wrench)
     rounding = jnp.asarray(256 * unit_roundoff(dtype), dtype) * (outer + norm * size)
-    off = leftover > rounding
+    off = outside > rounding
     rest = outer == 0
     total = size if weight is None else size + weight
     total = jnp.where(total > 0, total, jnp.ones_like(total))
     return jnp.stack([-x / total for x in inner]), total, off, rest
 
 
-def load(folded: Folded, projection: Projection, demand: Demand, dimension: int) -> tuple[Load, Array]:
+def load_of(tile: Tile, demand: Demand) -> tuple[Load, Array]:
     """The load in the metric of A, and which lanes are finite."""
+    folded, factor = tile.folded, tile.projection.factor
     wrench = to_lanes(demand.wrench)
-    rows, finite = _scaled_wrench(wrench[:dimension], wrench[dimension:], folded.length)
+    rows, finite = _scaled_wrench(wrench[: tile.dimension], wrench[tile.dimension :], folded.length)
     outer = as_vector(rows)
-    inner, left = solve_lower(projection.factor, outer)
-    rhs, size, off, rest = _load_size(inner, left, outer, folded.norm, demand.criterion.barrier_weight)
-    twist = null_combination(projection.factor, left)
-    return Load(outer, rhs, size, off, twist, rest), finite
+    inner, residual = solve_lower(factor, outer)
+    rhs, size, off, rest = _load_size(inner, residual, outer, folded.norm, demand.criterion.barrier_weight)
+    return Load(outer, rhs, size, off, null_combination(factor, residual), rest), finite
 
 
 @stage
@@ -150,7 +153,7 @@ def torque_rows(
     row_norm: Array | None = None,
 ) -> tuple[Cone, Array, Array]:
     """E with ``E s = J^T f``, normal components first, rows of norm 1; the norms; which lanes are finite."""
-    order = sorted(range(len(components)), key=lambda c: components[c] is not Component.NORMAL)
+    order = normal_first(components)
 
     @stage
     def run(jacobian: Array, exists: Array, friction: Array, torsion: Array) -> tuple[Cone, Array, Array]:
@@ -158,18 +161,16 @@ def torque_rows(
         zero = jnp.zeros_like(jacobian[0])
         parts, square = [], zero
         for c in order:
-            factor = scale.get(components[c], friction)
+            factor, row = scale.get(c, friction), components.index(c)
             rows = []
             for i in range(exists.shape[0]):
-                value = jnp.where(exists[i] > 0, jacobian[i * len(order) + c] * factor[i], zero)
+                value = jnp.where(exists[i] > 0, jacobian[i * len(order) + row] * factor[i], zero)
                 rows.append(value)
                 square = square + value * value
             parts.append(rows)
         norm = jnp.sqrt(square) if row_norm is None else row_norm
         usable = jnp.isfinite(norm) & (norm > 0)
-        sound = jnp.isfinite(norm[0])
-        for j in range(1, norm.shape[0]):
-            sound = sound & jnp.isfinite(norm[j])
+        sound = reduce(jnp.logical_and, [jnp.isfinite(norm[j]) for j in range(norm.shape[0])])
         norm = jnp.where(usable, norm, jnp.ones_like(norm))
         columns = tuple(
             jnp.stack([jnp.where(usable, x / norm, zero) for x in rows], axis=1) for rows in parts
@@ -190,11 +191,11 @@ def curvature(
     criterion: Criterion, contacts: Contacts, exists: Array, components: tuple[Component, ...]
 ) -> Curvature | None:
     """D of ``<s, D s> / 2``, or None."""
-    kinds = (Component.NORMAL, *(c for c in components if c is not Component.NORMAL))
+    order = normal_first(components)
 
     @stage
     def run(criterion: Criterion, exists: Array, friction: Array, torsion: Array) -> tuple[Array | None, ...]:
-        parts = [criterion.curvature(c, friction, torsion) for c in kinds]
+        parts = [criterion.curvature(c, friction, torsion) for c in order]
         return tuple(None if x is None else 2 * jnp.where(exists > 0, x, jnp.zeros_like(x)) for x in parts)
 
     parts = run(criterion, exists, to_lanes(contacts.friction), to_lanes(contacts.torsion))
@@ -202,25 +203,20 @@ def curvature(
     if head is None:
         return None
     tail = parts[1] if parts[1:] else jnp.zeros_like(head)
-    last = parts[-1] if Component.SPIN in kinds else None
+    last = parts[-1] if Component.SPIN in order else None
     assert tail is not None
     return Curvature(head, tail, last)
 
 
 @stage
-def _floors(
-    weight: Array, on_normal: Array, on_cone: Array, exists: Array, size: Array
-) -> tuple[Array, Array]:
-    share = exists * (weight / size)
-    return 2 * share * on_cone, share * on_normal
+def _floors(barrier: Barrier, exists: Array, size: Array) -> tuple[Array, Array]:
+    share = exists * (barrier.weight / size)
+    return 2 * share * barrier.on_cone, share * barrier.on_normal
 
 
 @stage
 def _all(flags: list[Array]) -> Array:
-    total = flags[0]
-    for flag in flags[1:]:
-        total = total & flag
-    return total
+    return reduce(jnp.logical_and, flags)
 
 
 @stage
@@ -229,7 +225,7 @@ def _positive_weight(weight: Array) -> tuple[Array, Array]:
     return jnp.where(good, weight, jnp.ones_like(weight)), good
 
 
-def cone_program(
+def force_program(
     contacts: Contacts,
     exists: Array,
     columns: Cone,
@@ -238,7 +234,7 @@ def cone_program(
     demand: Demand,
     components: tuple[Component, ...],
     row_norm: Array | None = None,
-) -> tuple[ConvexProgram, Array | None, Array]:
+) -> tuple[ConvexConeProgram, Array | None, Array]:
     """The program for forces ``size u``, ``columns u = rhs``; the norms of its torque rows; which limits are numbers.
 
     ``row_norm`` fixes what the torque rows are divided by.
@@ -256,13 +252,11 @@ def cone_program(
         row_norm,
     )
     cone_floor = head_floor = None
-    weight = criterion.barrier_weight
-    if weight is not None:
-        assert demand.log_det is not None
-        on_normal, on_cone, _ = (to_lanes(x) for x in demand.log_det)
-        cone_floor, head_floor = _floors(weight, on_normal, on_cone, exists, size)
+    barrier = demand.barrier()
+    if barrier is not None:
+        cone_floor, head_floor = _floors(barrier, exists, size)
     curved = curvature(criterion, contacts, exists, components)
-    program = ConvexProgram(
+    program = ConvexConeProgram(
         columns,
         rhs,
         exists,
@@ -282,119 +276,25 @@ def _per_size(smoothing: Array, size: Array, squared: bool) -> Array:
     return smoothing / (size * size) if squared else smoothing / size
 
 
-def balance(
-    contacts: Contacts,
-    folded: Folded,
-    projection: Projection,
-    demand: Demand,
-    components: tuple[Component, ...],
-    dimension: int,
-) -> Balance:
-    """The cone program of a tile."""
+def force_problem(tile: Tile, demand: Demand) -> ForceProblem:
+    """The program of a tile: numbers that are no problem are replaced by harmless ones, and said to be invalid."""
     criterion = demand.criterion
-    sound = [folded.valid]
+    sound = [tile.folded.valid]
     for name in ("weight", "length"):
         value = getattr(criterion, name, None)
         if value is not None:
             value, good = _positive_weight(value)
             criterion = eqx.tree_at(lambda c, name=name: getattr(c, name), criterion, value)
             sound.append(good)
-    demand = demand._replace(criterion=criterion)
-    loaded, finite = load(folded, projection, demand, dimension)
-    program, norm, good = cone_program(
-        contacts, folded.exists, projection.basis.columns, loaded.rhs, loaded.size, demand, components
+    safe = demand._replace(criterion=criterion)
+    load, finite = load_of(tile, safe)
+    program, norm, good = force_program(
+        tile.contacts,
+        tile.folded.exists,
+        tile.projection.basis.columns,
+        load.rhs,
+        load.size,
+        safe,
+        tile.components,
     )
-    return Balance(program, loaded, _all([*sound, finite, good]), norm)
-
-
-# Where a lane begins ------------------------------------------------------------------------------------
-
-
-@stage
-def _first_forces(program: ConvexProgram, basis: Cone, count: Array) -> tuple[Cone, Array]:
-    """The least-norm forces, pressed into the cones: ``u = Q^T b + depth e``."""
-    exists = program.exists
-    least = rmatvec(basis, as_vector(program.rhs))
-    depth = 1 + cone_max(exists * jnp.maximum(tail_norm(least) - least[0], jnp.zeros_like(exists)))
-    if program.cone_floor is not None and program.head_floor is not None:
-        depth = jnp.maximum(depth, count * cone_max(program.cone_floor + program.head_floor))
-    head = jnp.where(exists > 0, least[0] + depth, jnp.ones_like(exists))
-    share = exists
-    if program.curvature is not None:  # D u must be inside the cone, too
-        steepest = program.curvature.tail
-        if program.curvature.last is not None:
-            steepest = jnp.maximum(steepest, program.curvature.last)
-        share = exists / jnp.maximum(jnp.ones_like(exists), steepest / 2)
-    return (head, *(share * x for x in least[1:])), depth
-
-
-@stage
-def _first_prices(program: ConvexProgram, u: Cone, depth: Array, count: Array) -> Point:
-    """Slacks and prices that make the first forces dual feasible with y = 0, all products about ``depth / k``."""
-    exists, one = program.exists, jnp.ones_like(program.exists)
-    masks = program.masks()
-    share = one / count
-    xi = level = level_price = cap = cap_price = head = head_price = None
-    if program.level is not None:
-        xi = cone_max(exists * u[0]) + depth
-        level = jnp.where(exists > 0, xi - u[0], one)
-        level_price = jnp.where(exists > 0, share, one)
-    if program.cap is not None and masks.cap is not None:
-        room = jnp.where(masks.cap > 0, program.cap, one) - u[0]
-        cap = jnp.where(masks.cap > 0, jnp.maximum(room, depth / 2), one)
-        cap_price = jnp.where(masks.cap > 0, share / 2, one)
-    if program.head_floor is not None:
-        head = u[0]
-        head_price = jnp.where(exists > 0, jnp.minimum(program.head_floor / u[0], share / 2), one)
-        head_price = jnp.maximum(head_price, share / 100)
-    upper = price = None
-    if program.bound is not None:
-        _, product = program.products(u)
-        size = jnp.abs(product)
-        upper = jnp.maximum(program.bound - size, 0.5 * jnp.maximum(program.bound, size))
-        price = (depth / count) / upper
-    slack = Bounds(level, cap, head, upper, upper)
-    point = Point(
-        jnp.zeros_like(program.rhs), xi, u, u, slack, Bounds(level_price, cap_price, head_price, price, price)
-    )
-    z = program.stationarity(point)
-    z = (jnp.where(exists > 0, z[0], one), *(exists * x for x in z[1:]))
-    return point._replace(z=z)
-
-
-def starting_point(balance: Balance, projection: Projection, count: Array) -> Point:
-    """Dual feasible, inside every inequality; what ``B u = b`` and the limits lack is left to the solver."""
-    u, depth = _first_forces(balance.program, projection.basis.columns, count)
-    return _first_prices(balance.program, u, depth, count)
-
-
-# Proofs that a load cannot be held ----------------------------------------------------------------------
-
-
-@stage
-def power_left(program: ConvexProgram, rows: Array, limit: float) -> Array:
-    """``y.w - sum_i min(cap_i, limit) (|x_t,i| - x_0,i)+ - |beta|.bound`` over ``y.w``, x = A^T y + E^T beta.
-
-    Positive, with y.w > 0: the load does more work along the twist y (the joints moving at beta) than forces up to
-    ``limit`` times the load and torques up to their bounds can take up. Without limits: ``A_i^T y`` is in every cone.
-    """
-    m = program.rhs.shape[0]
-    x = rmatvec(program.columns, as_vector(rows))
-    short = program.exists * jnp.maximum(tail_norm(x) - x[0], jnp.zeros_like(x[0]))
-    most = jnp.full_like(short, limit)
-    if program.cap is not None:
-        most = jnp.minimum(most, program.cap)
-    taken = cone_sum(short * most)
-    if program.bound is not None:
-        for j in range(program.bound.shape[0]):
-            taken = taken + jnp.abs(rows[m + j]) * program.bound[j]
-    power = -program.rhs[0] * rows[0]
-    for i in range(1, m):
-        power = power - program.rhs[i] * rows[i]
-    worth = power > 0
-    return jnp.where(worth, 1 - taken / jnp.where(worth, power, jnp.ones_like(power)), -jnp.ones_like(power))
-
-
-def proves(program: ConvexProgram, rows: Array) -> Array:
-    """Whether ``rows`` prove that no forces up to ``FORCE_LIMIT`` times the load balance it."""
-    return power_left(program, rows, FORCE_LIMIT) > 0.5
+    return ForceProblem(tile, demand, program, load, _all([*sound, finite, good]), norm)

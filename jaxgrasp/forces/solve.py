@@ -20,15 +20,17 @@ from jax.typing import ArrayLike
 
 from ..backend import batched, in_chunks, in_sweeps, kernel, tile_width, to_lanes, to_rows
 from ..certificates import check_forces, checked_by, force_claim
-from ..conic import State, as_vector, begin_convex_program, regular, solve_convex_program
-from ..contacts import Component, Folded, Grasp, Projection, TorqueLimits, fold, project, to_twist
+from ..conic import ConvexState, as_vector, begin_convex_cone_program, regular, solve_convex_cone_program
+from ..contacts import Component, Grasp, TorqueLimits, tile_of, to_twist
 from ..core import Answer, Array, Bool, Float, Int, Status, gap_floor, unit_roundoff, wrench_dimension
 from .answer import Answer as LaneAnswer
 from .answer import answer
 from .criteria import Criterion, Gentlest
 from .demand import demand_rows, spread_loads
 from .derivatives import Rows, Scales, Solved, differentiable
-from .problem import Balance, balance, proves, starting_point
+from .infeasibility import proves
+from .problem import ForceProblem, force_problem
+from .starting_point import starting_point
 
 __all__ = ["OptimalForces", "optimize_forces"]
 
@@ -115,11 +117,9 @@ def _to_rows(tree: Any) -> Any:
     return jax.tree.map(to_rows, tree)
 
 
-def _problem(plan: _Plan, rows: Rows):
+def _problem(plan: _Plan, rows: Rows) -> ForceProblem:
     contacts, demand = rows
-    folded = fold(contacts, plan.components)
-    projection = project(folded)
-    return folded, projection, balance(contacts, folded, projection, demand, plan.components, plan.dimension)
+    return force_problem(tile_of(contacts, plan.components, plan.dimension), demand)
 
 
 class _Progress(NamedTuple):
@@ -129,7 +129,7 @@ class _Progress(NamedTuple):
     multipliers  (m,) of A itself, where those of the state belong to its orthonormal rows
     """
 
-    state: State
+    state: ConvexState
     answer: LaneAnswer
     smooth: Array
     scales: Scales | None
@@ -140,40 +140,34 @@ def _tile_kernel(plan: _Plan) -> Callable[..., _Progress]:
     """A tile's whole way. One kernel for first steps and stragglers alike: it is what takes long to compile."""
 
     @kernel
-    def run(rows: Rows, state: State, fresh: Array, budget: Array, tolerance: Array) -> _Progress:
-        contacts, demand = rows
-        folded, projection, problem = _problem(plan, rows)
+    def run(rows: Rows, state: ConvexState, fresh: Array, budget: Array, tolerance: Array) -> _Progress:
+        problem = _problem(plan, rows)
         load = problem.load
-        weighted = demand.criterion.barrier_weight is not None
+        weighted = problem.demand.criterion.barrier_weight is not None
         idle = jnp.zeros_like(load.rest) if weighted else load.rest
-        point = starting_point(problem, projection, folded.count)
-        start = begin_convex_program(problem.program, point, ~problem.valid | load.off | idle)
+        skip = ~problem.valid | load.off | idle
+        start = begin_convex_cone_program(problem.program, starting_point(problem), skip)
         state = jax.tree.map(lambda new, old: jnp.where(fresh, new, old), start, _to_lanes(state))
         # A robust bound is read off the forces, which doubles what they lack.
         goal = tolerance / 10 if weighted else tolerance
-        fine = 8 * unit_roundoff(tolerance.dtype)
-        state = solve_convex_program(problem.program, state, goal, proves, budget, fine)
-        result = answer(
-            contacts, folded, projection, problem, demand, state.point, state.ray, state.stop, 4 * tolerance,
-            plan.components, plan.dimension,
-        )  # fmt: skip
-        return _to_rows(_progress(plan, state, result, folded, projection, problem))
+        rounding = 8 * unit_roundoff(tolerance.dtype)
+        state = solve_convex_cone_program(problem.program, state, goal, proves, budget, rounding)
+        return _to_rows(_progress(plan, problem, state, answer(problem, state, 4 * tolerance)))
 
     return run
 
 
-def _progress(
-    plan: _Plan, state: State, result: LaneAnswer, folded: Folded, projection: Projection, problem: Balance
-) -> _Progress:
+def _progress(plan: _Plan, problem: ForceProblem, state: ConvexState, result: LaneAnswer) -> _Progress:
     optimal = (result.status == Status.OPTIMAL.value) & (state.stop != Status.SKIPPED.value)
     smooth = optimal
     if problem.program.smoothing is None:
         smooth = optimal & regular(problem.program, state.point)
     if not plan.with_point:
         return _Progress(state, result, smooth, None, None)
-    scales = Scales(folded.length, problem.load.size, projection.factor, problem.row_norm)
-    y = state.point.y
-    return _Progress(state, result, smooth, scales, jnp.stack(to_twist(projection, as_vector(y))))
+    tile = problem.tile
+    scales = Scales(tile.folded.length, problem.load.size, tile.projection.factor, problem.row_norm)
+    y = to_twist(tile.projection, as_vector(state.point.y))
+    return _Progress(state, result, smooth, scales, jnp.stack(y))
 
 
 def _solve_rows(plan: _Plan, rows: Rows, count: Array, tolerance: Array) -> Solved:
@@ -198,14 +192,9 @@ def _shapes(plan: _Plan, rows: Rows) -> _Progress:
     """The shapes of what a tile leaves behind."""
 
     def first(tile: Rows) -> _Progress:
-        folded, projection, problem = _problem(plan, tile)
-        point = starting_point(problem, projection, folded.count)
-        state = begin_convex_program(problem.program, point, ~problem.valid)
-        result = answer(
-            *tile[:1], folded, projection, problem, tile[1], state.point, state.ray, state.stop,
-            problem.load.size, plan.components, plan.dimension,
-        )  # fmt: skip
-        return _to_rows(_progress(plan, state, result, folded, projection, problem))
+        problem = _problem(plan, tile)
+        state = begin_convex_cone_program(problem.program, starting_point(problem), ~problem.valid)
+        return _to_rows(_progress(plan, problem, state, answer(problem, state, problem.load.size)))
 
     return jax.eval_shape(first, rows)
 

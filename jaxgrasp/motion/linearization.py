@@ -69,6 +69,7 @@ class Linearization(Answer):
         Status.MARGINAL: "Marginal equilibrium: some contact is at the edge of its friction cone, so its force may "
         "change one way only.",
         Status.NO_EQUILIBRIUM: "No equilibrium: no admissible contact forces carry the weight.",
+        Status.NOT_BALANCED: "The given forces are no equilibrium: they do not carry the weight, or leave their cones.",
         Status.INVALID: "Invalid: the numbers are not a grasp, a body and a gravity.",
     }
 

@@ -21,7 +21,7 @@ import optax
 from jax import lax
 
 from ..backend import tile_width
-from ..contacts import ContactModel, Grasp, kept
+from ..contacts import ContactModel, Grasp, filled
 from ..core import Array
 from ..surfaces import SmoothSurface
 from .objectives import Objective, look
@@ -93,7 +93,7 @@ class _Ground(NamedTuple):
 
 def _kept(where: Array, new: Any, old: Any) -> Any:
     """``new`` in the lanes ``where``, ``old`` in the others."""
-    return jax.tree.map(functools.partial(kept, where), new, old)
+    return jax.tree.map(functools.partial(filled, where), new, old)
 
 
 def _ground(plan: _Plan, numbers: Any, surface: SmoothSurface, model: ContactModel) -> _Ground:

@@ -11,7 +11,6 @@ derivative 0.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -20,26 +19,27 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ..backend import inlined, to_lanes, to_rows
+from ..backend import inlined, to_lanes
 from ..conic import (
     Bounds,
     Cholesky,
     Cone,
-    ConvexProgram,
-    Point,
-    Shift,
+    ConvexConeProgram,
+    ConvexPoint,
+    PointShift,
     centring,
     cone_sum,
+    kkt_solve,
     lagrangian,
-    newton_solve,
     point_tangent,
     residuals,
 )
 from ..contacts import (
+    BatchAxes,
     Component,
     Contacts,
+    filled,
     fold,
-    kept,
     masked,
     safe_contacts,
     tiled,
@@ -84,16 +84,16 @@ class _Form(NamedTuple):
     width: int
 
 
-def _program(form: _Form, contacts: Contacts, scales: Scales) -> ConvexProgram:
-    """``margin.margin_program`` of A itself as a differentiable function of the contacts."""
+def _program(form: _Form, contacts: Contacts, scales: Scales) -> ConvexConeProgram:
+    """``margin_program`` of A itself as a differentiable function of the contacts."""
     program = margin_program(fold(contacts, form.components, scales.length))
     none = (None,) * 7
-    return ConvexProgram(program.columns, jnp.stack(program.rhs), program.exists, program.cost[0], *none)
+    return ConvexConeProgram(program.columns, jnp.stack(program.rhs), program.exists, program.cost[0], *none)
 
 
-def _centring(form: _Form, contacts: Contacts, scales: Scales, point: Point) -> Shift:
+def _centring(form: _Form, contacts: Contacts, scales: Scales, point: ConvexPoint) -> PointShift:
     program = _program(form, contacts, scales)
-    return centring(program, point, lambda rhs: newton_solve(program, point, scales.factor, rhs))
+    return centring(program, point, lambda rhs: kkt_solve(program, point, scales.factor, rhs))
 
 
 def _added(a: Cone, b: Cone) -> Cone:
@@ -140,12 +140,8 @@ def differentiable(
 
 
 def _tangents(form: _Form, result: Solved, contacts: Contacts, change: Any) -> Solved:
-    batch = result.stop.shape
-    count = math.prod(batch)
-
-    def flat(x: Any) -> Any:
-        return x.reshape(count, *x.shape[len(batch) :])
-
+    batch = BatchAxes(result.stop.shape)
+    flat = batch.flat
     assert result.point is not None and result.scales is not None
     data, changes = jax.tree.map(flat, (contacts, change))
     ok = jnp.isfinite(flat(result.verdict.margin)) & (flat(result.stop) != Status.SKIPPED.value)
@@ -154,11 +150,11 @@ def _tangents(form: _Form, result: Solved, contacts: Contacts, change: Any) -> S
     apex = jnp.zeros(u.shape[1:2], u.dtype).at[0].set(1.0)[:, None]
 
     def cone(rows: Array) -> Cone:
-        lanes = to_lanes(kept(ok, rows, apex))
+        lanes = to_lanes(filled(ok, rows, apex))
         return tuple(lanes[i] for i in range(lanes.shape[0]))
 
-    point = Point(-to_lanes(kept(ok, y, 0.0)), None, cone(u), cone(z), NO_BOUNDS, NO_BOUNDS)
-    scales = jax.tree.map(lambda x: lax.stop_gradient(to_lanes(kept(ok, flat(x), 1.0))), result.scales)
+    point = ConvexPoint(-to_lanes(filled(ok, y, 0.0)), None, cone(u), cone(z), NO_BOUNDS, NO_BOUNDS)
+    scales = jax.tree.map(lambda x: lax.stop_gradient(to_lanes(filled(ok, flat(x), 1.0))), result.scales)
     program = _program(form, data, scales)
     fixed = lax.stop_gradient((data, scales))
     shift = tiled(partial(_centring, form), fixed[0], (fixed[1], lax.stop_gradient(point)), form.width)
@@ -174,15 +170,12 @@ def _tangents(form: _Form, result: Solved, contacts: Contacts, change: Any) -> S
         (changes, moved.u, -cost),
     )
 
-    y_read = -to_lanes(kept(ok, y, 0.0))
-    twist = kept(ok, flat(result.verdict.escape_twist), 0.0)
+    y_read = -to_lanes(filled(ok, y, 0.0))
+    twist = filled(ok, flat(result.verdict.escape_twist), 0.0)
     read = jnp.all(jnp.abs(_twist(y_read, scales.length) - to_lanes(twist)) < TWIST_READ, axis=0)
     _, turned = jax.jvp(lambda y: _twist(y, scales.length), (point.y,), (jnp.where(read, moved.y, 0.0),))
 
-    def back(x: Array) -> Array:
-        x = jnp.where(ok, x, jnp.zeros_like(x))
-        return to_rows(x).reshape(*batch, *x.shape[:-1])
-
+    back = partial(batch.back, ok)
     zero = jax.tree.map(zero_tangent, result)
     verdict = zero.verdict._replace(margin=back(-cost), internal_force=back(force), escape_twist=back(turned))
     moves = (back(-moved.y), back(jnp.stack(moved.u)), back(jnp.stack(moved.z)))

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from ..backend import stage
-from ..conic import Cone, ConeProgram, Iterate, Vector, cone_max, cone_sum, inner, tail_norm
+from ..conic import Cone, LinearConeProgram, LinearPoint, Vector, cone_max, cone_sum, inner, tail_norm
 from ..contacts import (
     Folded,
     Projection,
@@ -43,14 +43,14 @@ def identity(folded: Folded) -> Cone:
 
 
 class Start(NamedTuple):
-    """Where a lane begins: an interior iterate, and what the projection of e alone already shows.
+    """Where a lane begins: an interior point, and what the projection of e alone already shows.
 
     lower      (L,) the margin of the projected unit forces, a lower bound of t*
     escape     (L,) bool: the least-squares twist, ``A^T xi`` nearest to e, is an escape twist, so t* < 0
     unbounded  (L,) bool: e lies in the row space of A: no internal force has a normal component, t* = -inf
     """
 
-    iterate: Iterate
+    point: LinearPoint
     lower: Array
     escape: Array
     unbounded: Array
@@ -86,7 +86,7 @@ def starting_point(folded: Folded, projection: Projection) -> Start:
     # A lane the projection already refutes keeps its twist as the dual point.
     keep = escape | unbounded
     dual = tuple(jnp.where(keep, -v, jnp.zeros_like(v)) for v in y)
-    return Start(Iterate(dual, u, z), lower, escape, unbounded)
+    return Start(LinearPoint(dual, u, z), lower, escape, unbounded)
 
 
 @stage
@@ -94,13 +94,13 @@ def _deflated(normal_column: Array, resultant: Vector, share: Array) -> Array:
     return jnp.stack([normal_column[i] - r * share for i, r in enumerate(resultant)])
 
 
-def margin_program(folded: Folded) -> ConeProgram:
+def margin_program(folded: Folded) -> LinearConeProgram:
     """The cone program whose optimal value is -t*."""
     share = folded.exists / folded.count
     first = _deflated(folded.columns[0], folded.resultant, share)
     cost = (share, *(jnp.zeros_like(share) for _ in folded.columns[1:]))
     rhs = tuple(-r for r in folded.resultant)
-    return ConeProgram((first, *folded.columns[1:]), rhs, cost, folded.exists, constant=-1.0)
+    return LinearConeProgram((first, *folded.columns[1:]), rhs, cost, folded.exists, constant=-1.0)
 
 
 @stage

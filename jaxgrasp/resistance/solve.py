@@ -21,16 +21,16 @@ from jax.core import Tracer
 from ..backend import batched, in_chunks, kernel, map_selected, map_tiles, tile_width, to_lanes, to_rows
 from ..certificates import check_resistance, checked_by
 from ..conic import (
-    ConeProgram,
-    Iterate,
-    Progress,
-    begin_cone_program,
+    LinearConeProgram,
+    LinearPoint,
+    LinearState,
+    begin_linear_cone_program,
     cone_max,
     cone_sum,
     row_svd,
-    solve_cone_program,
+    solve_linear_cone_program,
 )
-from ..contacts import Component, Contacts, Folded, Grasp, contacts_of, fold, project, to_twist
+from ..contacts import Component, Contacts, Folded, Grasp, contacts_of, fold, project, tile_of, to_twist
 from ..core import (
     Answer,
     Array,
@@ -116,14 +116,14 @@ class _State(NamedTuple):
     stop: Array
 
     @classmethod
-    def pack(cls, progress: Progress) -> _State:
-        y, u, z = (to_rows(jnp.stack(part)) for part in progress.iterate)
+    def pack(cls, progress: LinearState) -> _State:
+        y, u, z = (to_rows(jnp.stack(part)) for part in progress.point)
         return cls(y, u, z, progress.gap, progress.iterations, progress.stalled, progress.stop)
 
-    def unpack(self) -> Progress:
+    def unpack(self) -> LinearState:
         parts = [to_lanes(x) for x in (self.y, self.u, self.z)]
-        iterate = Iterate(*(tuple(x[i] for i in range(x.shape[0])) for x in parts))
-        return Progress(iterate, self.gap, self.iterations, self.stalled, self.stop)
+        iterate = LinearPoint(*(tuple(x[i] for i in range(x.shape[0])) for x in parts))
+        return LinearState(iterate, self.gap, self.iterations, self.stalled, self.stop)
 
 
 class _Plan(NamedTuple):
@@ -144,11 +144,11 @@ def _room_for_rounding(folded: Folded, sigma: Array) -> Array:
     )
 
 
-def _decision(folded: Folded, sigma: Array) -> Callable[[ConeProgram, Iterate], Array]:
+def _decision(folded: Folded, sigma: Array) -> Callable[[LinearConeProgram, LinearPoint], Array]:
     """Whether the bracket proves a yes or a no, with the room for rounding that ``judge`` will ask for."""
     room = _room_for_rounding(folded, sigma)  # for a no, too: the twist L^-T y is at most |y| / sigma long
 
-    def decided(program: ConeProgram, point: Iterate) -> Array:
+    def decided(program: LinearConeProgram, point: LinearPoint) -> Array:
         lower = -program.primal_value(point.u)
         upper = -program.dual_value(point.y)
         square = point.y[0] * point.y[0]
@@ -175,8 +175,8 @@ def _setup_kernel(plan: _Plan) -> Callable[[Contacts], _Setup]:
         start = starting_point(folded, projection)
         program = margin_program(projection.basis)
         refuted = start.unbounded | (start.escape if plan.verdict_only else jnp.zeros_like(start.escape))
-        dual = tuple(jnp.where(refuted, v, jnp.zeros_like(v)) for v in start.iterate.y)
-        state = begin_cone_program(program, start.iterate._replace(y=dual), ~folded.valid | refuted)
+        dual = tuple(jnp.where(refuted, v, jnp.zeros_like(v)) for v in start.point.y)
+        state = begin_linear_cone_program(program, start.point._replace(y=dual), ~folded.valid | refuted)
         if plan.verdict_only:
             proven = start.lower > _room_for_rounding(folded, projection.sigma)
             stop = jnp.where(proven, jnp.int32(Status.DECIDED.value), state.stop)
@@ -192,7 +192,7 @@ def _iterate_kernel(plan: _Plan) -> Callable[..., _State]:
         folded = fold(contacts, plan.components)
         program = margin_program(project(folded).basis)
         decided = _decision(folded, sigma) if plan.verdict_only else None
-        return _State.pack(solve_cone_program(program, rows.unpack(), tolerance, budget, decided))
+        return _State.pack(solve_linear_cone_program(program, rows.unpack(), tolerance, budget, decided))
 
     return run
 
@@ -224,26 +224,14 @@ def _answer_kernel(plan: _Plan) -> Callable[..., _Reading]:
     def run(
         contacts: Contacts, rows: _State, unbounded: Array, rank_rows: Rank, tolerance: Array
     ) -> _Reading:
-        folded = fold(contacts, plan.components)
-        projection = project(folded)
-        iterate = rows.unpack().iterate
-        verdict = judge(
-            folded,
-            projection,
-            unbounded,
-            rank_rows._replace(null_twist=to_lanes(rank_rows.null_twist)),
-            iterate.u,
-            iterate.y,
-            tolerance,
-            plan.components,
-            to_lanes(contacts.friction),
-            to_lanes(contacts.torsion),
-            plan.dimension,
-        )
+        tile = tile_of(contacts, plan.components, plan.dimension)
+        point = rows.unpack().point
+        rank = rank_rows._replace(null_twist=to_lanes(rank_rows.null_twist))
+        verdict = judge(tile, rank, point.u, point.y, unbounded, tolerance)
         scales = multipliers = None
         if plan.with_point:
-            scales = Scales(folded.length, projection.factor)
-            multipliers = jnp.stack(to_twist(projection, iterate.y))
+            scales = Scales(tile.folded.length, tile.projection.factor)
+            multipliers = jnp.stack(to_twist(tile.projection, point.y))
         return jax.tree.map(to_rows, _Reading(verdict, scales, multipliers))
 
     return run

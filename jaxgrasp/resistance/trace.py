@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..conic import Progress, Step, advance, begin_cone_program
+from ..conic import LinearState, LinearStep, advance_linear_cone_program, begin_linear_cone_program
 from ..contacts import Component, Contacts, Grasp, contacts_of, fold, project
 from ..core import Array, Float, Status, gap_floor
 from .problem import margin_program, starting_point
@@ -67,21 +67,23 @@ def trace(grasp: Grasp, tolerance: float = 1e-8, max_iterations: int = TOTAL_BUD
     goal = jnp.asarray(max(tolerance, gap_floor(grasp.dtype)), grasp.dtype)
 
     @jax.jit
-    def first(rows: Contacts) -> Progress:
+    def first(rows: Contacts) -> LinearState:
         folded, projection, program = _tile(rows, components)
         start = starting_point(folded, projection)
-        dual = tuple(jnp.where(start.unbounded, v, jnp.zeros_like(v)) for v in start.iterate.y)
-        return begin_cone_program(program, start.iterate._replace(y=dual), ~folded.valid | start.unbounded)
+        dual = tuple(jnp.where(start.unbounded, v, jnp.zeros_like(v)) for v in start.point.y)
+        return begin_linear_cone_program(
+            program, start.point._replace(y=dual), ~folded.valid | start.unbounded
+        )
 
     @jax.jit
-    def values(rows: Contacts, state: Progress) -> tuple[Array, Array]:
+    def values(rows: Contacts, state: LinearState) -> tuple[Array, Array]:
         *_, program = _tile(rows, components)
-        return -program.primal_value(state.iterate.u), -program.dual_value(state.iterate.y)
+        return -program.primal_value(state.point.u), -program.dual_value(state.point.y)
 
     @jax.jit
-    def step(rows: Contacts, state: Progress) -> tuple[Progress, Step]:
+    def step(rows: Contacts, state: LinearState) -> tuple[LinearState, LinearStep]:
         *_, program = _tile(rows, components)
-        return advance(program, state, goal)
+        return advance_linear_cone_program(program, state, goal)
 
     state = first(rows)
     nan = float("nan")

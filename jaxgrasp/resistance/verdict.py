@@ -1,7 +1,7 @@
 """From a solved lane to a verdict with its proof: polish, certify, translate back (theory section 2).
 
-The conditions are the checker's (``certificate.py``) with a larger rounding constant, evaluated in the working dtype:
-what passes here passes there. Nothing is claimed that was not certified.
+The conditions are the checker's (``certificates/resistance.py``) with a larger rounding constant, evaluated in the
+working dtype: what passes here passes there. Nothing is claimed that was not certified.
 """
 
 from __future__ import annotations
@@ -11,18 +11,20 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from ..backend import stage
-from ..conic import Cone, Vector, cone_min, cone_sum, inner, interior_distance, matvec, rmatvec
-from ..contacts import (
-    Component,
-    Folded,
-    Projection,
-    normalized,
-    onto_null_space,
-    smallest_slack,
-    to_twist,
-    unfold,
+from ..conic import (
+    Cone,
+    Vector,
+    as_vector,
+    cone_min,
+    cone_sum,
+    inner,
+    interior_distance,
+    matvec,
+    rmatvec,
+    vector_norm,
 )
-from ..core import Array, Status, rank_tolerance, rounding_constant, unit_roundoff
+from ..contacts import Folded, Tile, normalized, onto_null_space, smallest_slack, to_body, to_twist, unfold
+from ..core import Array, Status, first_of, rank_tolerance, rounding_constant, unit_roundoff
 from .problem import upper_bound
 
 __all__ = ["Rank", "Verdict", "judge"]
@@ -47,22 +49,48 @@ class Verdict(NamedTuple):
     escape_twist: Array  # (m, L)
 
 
+class Primal(NamedTuple):
+    """What the solver's forces show: the internal force s next to them, and how far an exact one is.
+
+    slack      (L,) min_i s_0,i - |s_1..,i|       near   (L,) some exact internal force has at least slack - near
+    resistant  (L,) bool: it is inside every cone, and A has full rank
+    """
+
+    s: Cone
+    slack: Array
+    near: Array
+    resistant: Array
+
+
+class Dual(NamedTuple):
+    """What the solver's multipliers show: an upper bound of t*, and the twist behind it.
+
+    escapes    (L,) bool: no contact can oppose the twist     deficient  (L,) bool: A has not full rank
+    """
+
+    upper: Array
+    twist: Vector
+    escapes: Array
+    deficient: Array
+
+
+class Bracket(NamedTuple):
+    """t* lies in [lower, lower + gap] (L,); ``blur`` is what rounding can do to an end."""
+
+    lower: Array
+    gap: Array
+    blur: Array
+
+
 @stage
 def _norms(columns: Cone, s: Cone) -> tuple[Array, Array]:
     """``|A s|`` and ``|s|``."""
-    applied = matvec(columns, s)
-    square = applied[0] * applied[0]
-    for i in range(1, applied.shape[0]):
-        square = square + applied[i] * applied[i]
-    return jnp.sqrt(square), jnp.sqrt(cone_sum(inner(s, s)))
+    return vector_norm(as_vector(matvec(columns, s))), jnp.sqrt(cone_sum(inner(s, s)))
 
 
 @stage
 def _unit_twist(y: Vector) -> Vector:
-    square = y[0] * y[0]
-    for v in y[1:]:
-        square = square + v * v
-    size = jnp.sqrt(square)
+    size = vector_norm(y)
     safe = jnp.where((size > 0) & jnp.isfinite(size), size, jnp.ones_like(size))
     return tuple(v / safe for v in y)
 
@@ -87,88 +115,103 @@ def _unseen(columns: Cone, xi: Vector) -> Array:
     return jnp.sqrt(cone_sum(inner(x, x)))
 
 
-def judge(
-    folded: Folded,
-    projection: Projection,
-    unbounded: Array,
-    rank: Rank,
-    u: Cone,
-    y: Vector,
-    tolerance: Array,
-    components: tuple[Component, ...],
-    friction: Array,
-    torsion: Array,
-    dimension: int,
-) -> Verdict:
-    """Certify one tile. ``rank`` is consulted only where the projection could not prove full rank itself."""
-    dtype = folded.norm.dtype
-    eps = unit_roundoff(dtype)
-    rounding = jnp.asarray(rounding_constant() * eps, dtype)
-    m = len(y)
+def judge(tile: Tile, rank: Rank, u: Cone, y: Vector, unbounded: Array, tolerance: Array) -> Verdict:
+    """Certify one tile at the solver's forces u and multipliers y.
+
+    rank       consulted only where the projection could not prove full rank itself
+    unbounded  (L,) bool: t* = -inf
+    """
+    folded, m = tile.folded, len(y)
+    count = jnp.where(tile.projection.sigma > 0, m * jnp.ones_like(folded.norm), rank.count)
+    full_rank = count >= m
+    primal = _primal_evidence(tile, rank, full_rank, u)
+    dual = _dual_evidence(tile, rank, full_rank, y)
+    bracket = _bracket(primal, dual)
+    status = _status(folded.valid, full_rank, primal, dual, bracket, tolerance)
+
+    force = unfold(primal.s, tile.components, *tile.coefficients)
+    twist = jnp.stack(_unit_twist(to_body(dual.twist, folded.length, tile.dimension)))
+    twist = jnp.where(status == Status.RESISTANT.value, jnp.zeros_like(twist), twist)
     one = jnp.ones_like(folded.norm)
 
-    # Primal evidence: the exact internal force next to s = u - t e ...
+    def valid(x: Array) -> Array:
+        return jnp.where(folded.valid, x, jnp.nan * one)
+
+    return Verdict(
+        status,
+        valid(jnp.where(unbounded, -jnp.inf * one, bracket.lower)),
+        valid(jnp.where(unbounded, jnp.zeros_like(bracket.gap), bracket.gap)),
+        valid(count),
+        valid(jnp.where(unbounded, jnp.zeros_like(force), force)),
+        valid(twist),
+    )
+
+
+def _rounding(folded: Folded) -> Array:
+    dtype = folded.norm.dtype
+    return jnp.asarray(rounding_constant() * unit_roundoff(dtype), dtype)
+
+
+def _primal_evidence(tile: Tile, rank: Rank, full_rank: Array, u: Cone) -> Primal:
+    """The exact internal force next to ``s = u - t e``."""
+    folded, projection, rounding = tile.folded, tile.projection, _rounding(tile.folded)
+    eps, one = unit_roundoff(folded.norm.dtype), jnp.ones_like(folded.norm)
     t = 1 - cone_sum(folded.exists * u[0]) / folded.count
     s = (folded.exists * (u[0] + t), *(folded.exists * x for x in u[1:]))
     s = normalized(folded, onto_null_space(projection, s))
     slack = smallest_slack(folded.exists, s)
     residual, size = _norms(folded.columns, s)
-    proven = projection.sigma > 0
-    sigma = jnp.where(proven, projection.sigma, rank.smallest)
-    count = jnp.where(proven, m * one, rank.count)
-    full_rank = count >= m
+    sigma = jnp.where(projection.sigma > 0, projection.sigma, rank.smallest)
     room = sigma - rounding * folded.norm
-    shift = jnp.sqrt(2 * one) * (residual + rounding * folded.norm * size) / jnp.where(room > 0, room, one)
-    resistant = full_rank & (room > 0) & (shift < slack)
+    safe = jnp.where(room > 0, room, one)
+    shift = jnp.sqrt(2 * one) * (residual + rounding * folded.norm * size) / safe
+    # The exact internal force lies within near / 2 of s.
+    near = 2 * jnp.sqrt(2 * one) * (residual + 4 * eps * folded.norm * size) / safe
+    certain = full_rank & (room > 0)
+    return Primal(s, slack, jnp.where(certain, near, jnp.zeros_like(near)), certain & (shift < slack))
 
-    # ... and dual evidence: the bound of t*, and the twist behind it. Where t* is huge and negative the iterates may
-    # stall, but the twist of the projection still escapes.
-    simple = projection.basis.resultant
-    upper = upper_bound(projection.basis, y)
-    bound = upper_bound(projection.basis, tuple(-v for v in simple))
+
+def _dual_evidence(tile: Tile, rank: Rank, full_rank: Array, y: Vector) -> Dual:
+    """The bound of t*, and the twist behind it.
+
+    Where t* is huge and negative the iterates may stall, but the twist of the projection still escapes.
+    """
+    folded, basis = tile.folded, tile.projection.basis
+    simple = basis.resultant
+    upper = upper_bound(basis, y)
+    bound = upper_bound(basis, tuple(-v for v in simple))
     better = bound < upper
-    upper = jnp.where(better, bound, upper)
     opposing = tuple(jnp.where(better, a, -b) for a, b in zip(simple, y, strict=True))
-    xi = _unit_twist(to_twist(projection, opposing))
-    escapes = _escape_depth(folded.columns, folded.exists, xi, rounding) > 0
-    null = tuple(rank.null_twist[i] for i in range(m))
-    deficient = ~full_rank & (_unseen(folded.columns, null) <= rank_tolerance(dtype) * folded.norm)
-
-    # The exact internal force next to s lies within near / 2 of it, so its slack is at least slack - near.
-    blur = 16 * eps * (1 + jnp.abs(slack) + jnp.abs(upper))
-    near = 2 * jnp.sqrt(2 * one) * (residual + 4 * eps * folded.norm * size) / jnp.where(room > 0, room, one)
-    margin = slack - blur - jnp.where(full_rank & (room > 0), near, jnp.zeros_like(near))
-    upper = upper + blur
-    margin, upper = (
-        jnp.minimum(margin, upper),
-        jnp.maximum(margin, upper),
-    )  # rounding must not turn the bracket round
-    gap = upper - margin
-    close = tolerance + 2 * blur
-    marginal = full_rank & (margin >= -close) & (margin + gap <= close)
-
-    def choose(status: Status, where: Array, otherwise: Array) -> Array:
-        return jnp.where(where, jnp.int32(status.value), otherwise)
-
-    status = choose(Status.MARGINAL, marginal, jnp.full(one.shape, Status.UNDECIDED.value, jnp.int32))
-    status = choose(Status.NOT_RESISTANT, deficient | escapes, status)
-    status = choose(Status.RESISTANT, resistant, status)
-    status = choose(Status.INVALID, ~folded.valid, status)
-
-    none = unbounded
-    margin = jnp.where(none, -jnp.inf * one, margin)
-    gap = jnp.where(none, jnp.zeros_like(gap), gap)
-    nan = jnp.nan * one
-    force = unfold(s, components, friction, torsion)
-    force = jnp.where(none, jnp.zeros_like(force), force)
-
+    xi = _unit_twist(to_twist(tile.projection, opposing))
+    escapes = _escape_depth(folded.columns, folded.exists, xi, _rounding(folded)) > 0
+    null = as_vector(rank.null_twist)
+    unseen = _unseen(folded.columns, null) <= rank_tolerance(folded.norm.dtype) * folded.norm
+    deficient = ~full_rank & unseen
     use_null = deficient & ~escapes
-    xi = tuple(jnp.where(use_null, b, a) for a, b in zip(xi, null, strict=True))
-    physical = tuple(v if i < dimension else v / folded.length for i, v in enumerate(xi))
-    twist = jnp.stack(_unit_twist(physical))
-    twist = jnp.where(status == Status.RESISTANT.value, jnp.zeros_like(twist), twist)
+    twist = tuple(jnp.where(use_null, b, a) for a, b in zip(xi, null, strict=True))
+    return Dual(jnp.where(better, bound, upper), twist, escapes, deficient)
 
-    def valid(x: Array) -> Array:
-        return jnp.where(folded.valid, x, nan)
 
-    return Verdict(status, valid(margin), valid(gap), valid(count), valid(force), valid(twist))
+def _bracket(primal: Primal, dual: Dual) -> Bracket:
+    eps = unit_roundoff(primal.slack.dtype)
+    blur = 16 * eps * (1 + jnp.abs(primal.slack) + jnp.abs(dual.upper))
+    lower, upper = primal.slack - blur - primal.near, dual.upper + blur
+    # Rounding must not turn the bracket round.
+    lower, upper = jnp.minimum(lower, upper), jnp.maximum(lower, upper)
+    return Bracket(lower, upper - lower, blur)
+
+
+def _status(
+    valid: Array, full_rank: Array, primal: Primal, dual: Dual, bracket: Bracket, tolerance: Array
+) -> Array:
+    close = tolerance + 2 * bracket.blur
+    marginal = full_rank & (bracket.lower >= -close) & (bracket.lower + bracket.gap <= close)
+    return first_of(
+        [
+            (~valid, Status.INVALID),
+            (primal.resistant, Status.RESISTANT),
+            (dual.deficient | dual.escapes, Status.NOT_RESISTANT),
+            (marginal, Status.MARGINAL),
+        ],
+        Status.UNDECIDED,
+    )

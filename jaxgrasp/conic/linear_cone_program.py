@@ -1,4 +1,4 @@
-"""The optimisation problem: data, and the residuals that define its solution.
+"""The cone program with a linear cost: data, and the residuals that define its solution.
 
     minimise    c_0 + <c, u>   subject to   B u = b,  u in K            (primal)
     maximise    c_0 + <b, y>   subject to   z = c - B^T y in K          (dual)
@@ -11,13 +11,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from ..core import Array
-from .cone import Cone, cone_sum, inner, scaled_product
-from .linear import matvec, rmatvec
+from .cone import Cone, cone_sum, inner, jordan_product
+from .products import matvec, rmatvec
 
-__all__ = ["ConeProgram"]
+__all__ = ["LinearConeProgram"]
 
 
-class ConeProgram(NamedTuple):
+class LinearConeProgram(NamedTuple):
     """One tile of cone programs, lanes on the last axis.
 
     columns  d arrays (m, k, L): B, split by cone component
@@ -55,4 +55,4 @@ class ConeProgram(NamedTuple):
 
     def optimality(self, y: tuple[Array, ...], u: Cone) -> tuple[tuple[Array, ...], Cone]:
         """``(b - B u, u o z)``: zero exactly at a primal-dual solution with u and z in K."""
-        return self.residual(u), scaled_product(u, self.slack(y))
+        return self.residual(u), jordan_product(u, self.slack(y))

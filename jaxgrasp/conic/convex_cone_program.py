@@ -1,4 +1,4 @@
-"""The convex program of force optimisation, without the word force: cones, a level, limits, fixed barriers.
+"""The cone program with a convex cost: cones, a level, limits, fixed barriers.
 
     minimise    <c, u_0> + <u, D u> / 2 + g xi - sum_i (phi_i / 2 log det u_i + psi_i log u_0,i)
     subject to  B u = b,  u in K,  u_0,i <= xi,  u_0,i <= cap_i,  |E u| <= bound
@@ -10,23 +10,20 @@ optimal where ``stationarity`` gives its z and every product of a slack and its 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
 from ..core import Array
 from .cone import Cone, cone_sum, inner
-from .linear import Vector, matvec, rmatvec
+from .products import as_vector, matvec, rmatvec
 
 # An array, or None where a program has no such part. A checker of types would ask for the same case distinction in
 # every formula, so it is told nothing.
-Optional = Any
+OptionalArray = Any
 
-__all__ = ["Bounds", "ConvexProgram", "Curvature", "Point", "as_vector"]
-
-
-def as_vector(rows: Array) -> Vector:
-    return tuple(rows[i] for i in range(rows.shape[0]))
+__all__ = ["Bounds", "ConvexConeProgram", "ConvexPoint", "Curvature", "OptionalArray", "map_bounds"]
 
 
 class Curvature(NamedTuple):
@@ -34,7 +31,7 @@ class Curvature(NamedTuple):
 
     head: Array
     tail: Array
-    last: Optional
+    last: OptionalArray
 
     def apply(self, u: Cone) -> Cone:
         """``D u``."""
@@ -50,11 +47,11 @@ class Bounds(NamedTuple):
     head   (k, L): u_0,i >= 0           upper, lower  (q, L): bound - E u >= 0, bound + E u >= 0
     """
 
-    level: Optional
-    cap: Optional
-    head: Optional
-    upper: Optional
-    lower: Optional
+    level: OptionalArray
+    cap: OptionalArray
+    head: OptionalArray
+    upper: OptionalArray
+    lower: OptionalArray
 
     def net(self) -> Array | float:
         """What prices add to the gradient in u_0: level + cap - head."""
@@ -65,7 +62,7 @@ class Bounds(NamedTuple):
             total = total + self.cap
         return total if self.head is None else total - self.head
 
-    def sum_on_head(self) -> Optional:
+    def sum_on_head(self) -> OptionalArray:
         """level + cap + head, of rates: how prices on u_0 answer to u_0; None where there are none."""
         present = [x for x in (self.level, self.cap, self.head) if x is not None]
         total = present[0] if present else None
@@ -74,11 +71,16 @@ class Bounds(NamedTuple):
         return total
 
 
-class Point(NamedTuple):
+def map_bounds(function: Callable, *bounds: Bounds) -> Bounds:
+    """``function`` on the families that exist."""
+    return Bounds(*(None if parts[0] is None else function(*parts) for parts in zip(*bounds, strict=True)))
+
+
+class ConvexPoint(NamedTuple):
     """A primal-dual point strictly inside every inequality; y (m, L), xi (L,), u and z d arrays (k, L)."""
 
     y: Array
-    xi: Optional
+    xi: OptionalArray
     u: Cone
     z: Cone
     slack: Bounds
@@ -91,7 +93,7 @@ class Point(NamedTuple):
         return jnp.concatenate([self.y, self.price.upper - self.price.lower])
 
 
-class ConvexProgram(NamedTuple):
+class ConvexConeProgram(NamedTuple):
     """One tile of programs, lanes on the last axis; k cones of dimension d, m equations, q two-sided rows.
 
     columns     d arrays (m + q, k, L): B over E
@@ -106,14 +108,14 @@ class ConvexProgram(NamedTuple):
     columns: Cone
     rhs: Array
     exists: Array
-    price: Optional
+    price: OptionalArray
     curvature: Curvature | None
-    level: Optional
-    cap: Optional
-    bound: Optional
-    cone_floor: Optional
-    head_floor: Optional
-    smoothing: Optional = None
+    level: OptionalArray
+    cap: OptionalArray
+    bound: OptionalArray
+    cone_floor: OptionalArray
+    head_floor: OptionalArray
+    smoothing: OptionalArray = None
 
     def masks(self) -> Bounds:
         """Ones where an inequality exists."""
@@ -127,14 +129,14 @@ class ConvexProgram(NamedTuple):
     def floors(self) -> Bounds:
         """What each slack times its price aims at."""
         masks = self.masks()
-        base = Bounds(*(None if m is None else jnp.zeros_like(m) for m in masks))
+        base = map_bounds(jnp.zeros_like, masks)
         if self.head_floor is not None:
             base = base._replace(head=self.head_floor)
         if self.smoothing is None:
             return base
-        return Bounds(*(None if b is None else b + self.smoothing for b in base))
+        return map_bounds(lambda floor: floor + self.smoothing, base)
 
-    def cone_target(self) -> Optional:
+    def cone_target(self) -> OptionalArray:
         """What <u_i, z_i> aims at, or None for 0."""
         if self.smoothing is None:
             return self.cone_floor
@@ -145,10 +147,10 @@ class ConvexProgram(NamedTuple):
         applied, m = matvec(self.columns, u), self.rhs.shape[0]
         return applied[:m], None if self.bound is None else applied[m:]
 
-    def bound_residuals(self, u: Cone, product: Optional, slack: Bounds) -> Bounds:
+    def bound_residuals(self, u: Cone, product: OptionalArray, slack: Bounds) -> Bounds:
         """What the slacks still lack: ``cap - u_0 - slack``, ``bound -+ E u - slack``; 0 elsewhere."""
         masks = self.masks()
-        zero = Bounds(*(None if m is None else jnp.zeros_like(m) for m in masks))
+        zero = map_bounds(jnp.zeros_like, masks)
         if self.cap is not None and masks.cap is not None:
             cap = jnp.where(masks.cap > 0, self.cap, jnp.zeros_like(self.cap))
             zero = zero._replace(cap=masks.cap * (cap - u[0] - slack.cap))
@@ -158,6 +160,24 @@ class ConvexProgram(NamedTuple):
             )
         return zero
 
+    def slack_changes(self, masks: Bounds, missing: Bounds, du: Cone, dxi: OptionalArray) -> Bounds:
+        """Changes of the slacks that remove ``missing`` while u moves by du and the level by dxi."""
+        slack = missing
+        if slack.level is not None and masks.level is not None:
+            slack = slack._replace(level=masks.level * (dxi - du[0]))
+        if slack.cap is not None:
+            slack = slack._replace(cap=slack.cap - masks.cap * du[0])
+        if slack.head is not None:
+            slack = slack._replace(head=du[0])
+        if slack.upper is not None:
+            _, product = self.products(du)
+            slack = slack._replace(upper=slack.upper - product, lower=slack.lower + product)
+        return slack
+
+    def rates(self, masks: Bounds, point: ConvexPoint) -> Bounds:
+        """``price / slack`` of every inequality: its share of the Newton matrix."""
+        return map_bounds(lambda m, s, p: m * p / s, masks, point.slack, point.price)
+
     def gradient(self, u: Cone, rows: Array, head: Array | float) -> Cone:
         """``D u + B^T y + E^T beta + head e_0`` with ``rows`` = (y; beta)."""
         total = rmatvec(self.columns, as_vector(rows))
@@ -166,14 +186,14 @@ class ConvexProgram(NamedTuple):
             total = tuple(a + b for a, b in zip(total, self.curvature.apply(u), strict=True))
         return total
 
-    def stationarity(self, point: Point) -> Cone:
+    def stationarity(self, point: ConvexPoint) -> Cone:
         """What z must be: the gradient of the Lagrangian without its cone term."""
         masks = self.masks()
-        price = Bounds(*(None if m is None else m * p for m, p in zip(masks, point.price, strict=True)))
+        price = map_bounds(jnp.multiply, masks, point.price)
         head = price.net() if self.price is None else self.price + price.net()
         return self.gradient(point.u, point.rows(), head)
 
-    def size(self, point: Point) -> Array:
+    def size(self, point: ConvexPoint) -> Array:
         """(L,) the objective without its barriers, which is positive: what gaps are relative to."""
         total = jnp.zeros_like(self.exists[0])
         if self.price is not None:

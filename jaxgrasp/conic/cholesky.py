@@ -1,0 +1,157 @@
+"""Cholesky for many small symmetric positive semidefinite systems, lanes on the last axis.
+
+The m x m structure (m = 3 or 6) is unrolled; each line below is vector code over lanes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+
+from ..backend import stage
+from ..core import Array
+from .products import Vector
+
+__all__ = [
+    "Cholesky",
+    "cholesky",
+    "cholesky_solve",
+    "inverse_frobenius",
+    "null_combination",
+    "solve_lower",
+    "solve_transposed",
+]
+
+
+class Cholesky(NamedTuple):
+    """``M = L L^T``: ``columns[j]`` holds L[j:, j], ``inverse[j]`` is 1 / L[j, j], or 0 where that was rounding."""
+
+    columns: tuple[Array, ...]
+    inverse: tuple[Array, ...]
+
+
+@stage
+def _schur_column(column: Array, previous: list[tuple[Array, Array]]) -> Array:
+    for below, head in previous:
+        column = column - below * head
+    return column
+
+
+@stage
+def _inverse_pivot(pivot: Array, threshold: Array) -> Array:
+    # A dependent row gets a zero, which solves consistent singular systems and touches nothing else.
+    positive = pivot > threshold
+    return jnp.where(
+        positive, lax.rsqrt(jnp.where(positive, pivot, jnp.ones_like(pivot))), jnp.zeros_like(pivot)
+    )
+
+
+@stage
+def _floor(diagonal: Vector, factor: Array) -> Array:
+    largest = diagonal[0]
+    for d in diagonal[1:]:
+        largest = jnp.maximum(largest, d)
+    return factor * largest
+
+
+@stage
+def _scaled(column: Array, factor: Array) -> Array:
+    return column * factor
+
+
+def cholesky(M: tuple[Array, ...], tolerance: float) -> Cholesky:
+    """Factor M, positive semidefinite, given by its lower columns ``M[j]`` of shape (m - j, L).
+
+    A pivot counts as zero at or below ``tolerance`` times its own diagonal entry (cancellation), or at or below
+    ``(2 tolerance)^2`` times the largest one (a row of B that is rounding as a whole).
+    """
+    dtype = M[0].dtype
+    floor = _floor(tuple(column[0] for column in M), jnp.asarray(4 * tolerance * tolerance, dtype))
+    columns: list[Array] = []
+    inverse: list[Array] = []
+    for j, lower in enumerate(M):
+        previous = [(columns[q][j - q :], columns[q][j - q]) for q in range(j)]
+        column = _schur_column(lower, previous) if previous else lower
+        inverse.append(
+            _inverse_pivot(column[0], jnp.maximum(lower[0] * jnp.asarray(tolerance, dtype), floor))
+        )
+        columns.append(_scaled(column, inverse[-1]))
+    return Cholesky(tuple(columns), tuple(inverse))
+
+
+def _back_substituted(factor: Cholesky, rhs: Vector) -> Vector:
+    columns, inverse = factor
+    x = list(rhs)
+    for i in reversed(range(len(x))):
+        for q in range(i + 1, len(x)):
+            x[i] = x[i] - columns[i][q - i] * x[q]
+        x[i] = x[i] * inverse[i]
+    return tuple(x)
+
+
+@stage
+def cholesky_solve(factor: Cholesky, rhs: Vector) -> Vector:
+    """``M^-1 rhs`` by forward and back substitution."""
+    columns, inverse = factor
+    x = list(rhs)
+    for i in range(len(x)):
+        for q in range(i):
+            x[i] = x[i] - columns[q][i - q] * x[q]
+        x[i] = x[i] * inverse[i]
+    return _back_substituted(factor, tuple(x))
+
+
+@stage
+def solve_transposed(factor: Cholesky, rhs: Vector) -> Vector:
+    """``L^-T rhs``; zero where the pivot was rounding."""
+    return _back_substituted(factor, rhs)
+
+
+@stage
+def solve_lower(factor: Cholesky, rhs: Vector) -> tuple[Vector, Vector]:
+    """x with ``L x = rhs`` as far as L goes, and the residual in the rows whose pivot was rounding."""
+    columns, inverse = factor
+    x, residual = list(rhs), []
+    for i in range(len(x)):
+        for q in range(i):
+            x[i] = x[i] - columns[q][i - q] * x[q]
+        residual.append(jnp.where(inverse[i] > 0, jnp.zeros_like(x[i]), x[i]))
+        x[i] = x[i] * inverse[i]
+    return tuple(x), tuple(residual)
+
+
+@stage
+def null_combination(factor: Cholesky, dependent: Vector) -> Vector:
+    """v with ``v^T A = 0`` for A = L Q and ``v_i = dependent_i`` in the rows that depend on those above them."""
+    columns, inverse = factor
+    v = list(dependent)
+    for i in reversed(range(len(v))):
+        total = jnp.zeros_like(v[i])
+        for q in range(i + 1, len(v)):
+            total = total - columns[i][q - i] * v[q]
+        v[i] = jnp.where(inverse[i] > 0, total * inverse[i], v[i])
+    return tuple(v)
+
+
+@stage
+def inverse_frobenius(factor: Cholesky) -> Array:
+    """``|L^-1|_F^2 = trace(M^-1)``, an upper bound of 1 / lambda_min(M); infinite where a pivot was dropped."""
+    columns, inverse = factor
+    m = len(inverse)
+    total = jnp.zeros_like(inverse[0])
+    full = inverse[0] > 0
+    for j in range(m):
+        x: dict[int, Array] = {}
+        for i in range(j, m):
+            if i == j:
+                x[i] = inverse[i]
+            else:
+                entry = -columns[j][i - j] * x[j]
+                for q in range(j + 1, i):
+                    entry = entry - columns[q][i - q] * x[q]
+                x[i] = entry * inverse[i]
+            total = total + x[i] * x[i]
+        full = full & (inverse[j] > 0)
+    return jnp.where(full, total, jnp.full_like(total, jnp.inf))
