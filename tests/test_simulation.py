@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from families import random_contacts
-from motion_families import random_bodies, random_states
+from grasps import random_contacts
+from motion import random_bodies, random_states
 
 import jaxgrasp as jg
 from jaxgrasp.motion.linearization import _blocks

@@ -302,7 +302,9 @@ class SoftFinger(ContactModel):
 MODELS: dict[str, type[ContactModel]] = {"hard": HardFinger, "soft": SoftFinger, "frictionless": Frictionless}
 
 
-def contact_model(name: str, friction: Any, torsion: Any) -> ContactModel:
+def contact_model(
+    name: str, friction: Float[ArrayLike, "*batch"], torsion: Float[ArrayLike, "*batch"]
+) -> ContactModel:
     """The model of this name in ``MODELS`` with mu and gamma (m) per contact; those it does not have are left out."""
     return MODELS[name]().with_coefficients(jnp.asarray(friction), jnp.asarray(torsion))
 

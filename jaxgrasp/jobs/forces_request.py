@@ -145,7 +145,8 @@ def _load(request: ForcesRequest, dimension: int) -> Load:
 def _status(name: str | None) -> Status | None:
     if name is None:
         return None
-    names = {status.name.replace("_", "-").lower(): status for status in Status}
+    known = (Status(value) for value in range(Status.RESISTANT, Status.STALLED + 1))
+    names = {status.name.replace("_", "-").lower(): status for status in known}
     if name not in names:
         raise UserError(f"unknown status {name!r}; take one of {', '.join(names)}")
     return names[name]
