@@ -106,9 +106,7 @@ keep = jg.regulator(few, body, timestep=H, effort=3.0)
 print("stabilises:", keep.stabilizes.tolist())
 assert keep.stabilizes.tolist() == [True, False]
 start = jg.BodyState.at_rest(3, (2,)).displaced(jnp.array([0.0, 0, 0, 0.1, 0.02, 0]))
-swing = jg.close_loop(
-    few, body, controller=keep, state=start, simulation=jg.motion.Simulation(STEPS, timestep=H)
-)
+swing = jg.close_loop(few, body, controller=keep, state=start, simulation=jg.motion.Simulation(STEPS, H))
 figure = plots.swing(H * np.arange(STEPS), swing, ("line above", "line through"))
 assert float(swing.orientation_error[-1, 0]) < 1e-3 < 0.09 < float(swing.orientation_error[-1, 1])
 assert float(swing.cone_use.max()) <= 1 + 1e-9
@@ -136,10 +134,9 @@ at_rest = jg.BodyState.at_rest(3, (8,))
 
 def held(grasp, push, plant=None):
     """Eight lanes under computed torque."""
-    simulation = jg.motion.Simulation(STEPS, timestep=H, plant=plant)
-    return jg.close_loop(
-        grasp, mug_body, controller=control, state=at_rest, simulation=simulation, disturbance=push
-    )
+    run = jg.motion.Simulation(STEPS, H, plant=plant)
+    loop = {"controller": control, "state": at_rest, "simulation": run}
+    return jg.close_loop(grasp, mug_body, disturbance=push, **loop)
 
 
 out = held(on_mug, push)
