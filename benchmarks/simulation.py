@@ -102,10 +102,8 @@ def closed_loop(
             body,
             controller=controller,
             state=start,
-            steps=steps,
-            timestep=H,
+            simulation=jg.motion.Simulation(steps, timestep=H, plant=plant),
             disturbance=jnp.asarray(push),
-            plant=plant,
         )
 
     first, times, out = clocked(run, repeats)

@@ -15,7 +15,9 @@ keep = jg.regulator(grasps, body, timestep=0.002, effort=3.0)
 start = jg.BodyState.at_rest(3, (2,)).displaced(
     jax.numpy.array([0, 0, 0, 0.1, 0, 0])
 )  # 0.1 rad about the fingers
-loop = jg.close_loop(grasps, body, controller=keep, state=start, steps=1500, timestep=0.002)
+loop = jg.close_loop(
+    grasps, body, controller=keep, state=start, simulation=jg.motion.Simulation(1500, timestep=0.002)
+)
 for lane, name in enumerate(("above", "through")):
     word = jg.Status(int(loop.status[-1, lane])).name
     tilt = loop.orientation_error[-1, lane]

@@ -106,7 +106,7 @@ keep = jg.regulator(few, body, timestep=H, effort=3.0)
 print("stabilises:", keep.stabilizes.tolist())
 assert keep.stabilizes.tolist() == [True, False]
 start = jg.BodyState.at_rest(3, (2,)).displaced(jnp.array([0.0, 0, 0, 0.1, 0.02, 0]))
-swing = jg.close_loop(few, body, controller=keep, state=start, steps=STEPS, timestep=H)
+swing = jg.close_loop(few, body, controller=keep, state=start, simulation=jg.motion.Simulation(STEPS, H))
 figure = plots.swing(H * np.arange(STEPS), swing, ("line above", "line through"))
 assert float(swing.orientation_error[-1, 0]) < 1e-3 < 0.09 < float(swing.orientation_error[-1, 1])
 assert float(swing.cone_use.max()) <= 1 + 1e-9
@@ -134,8 +134,9 @@ at_rest = jg.BodyState.at_rest(3, (8,))
 
 def held(grasp, push, plant=None):
     """Eight lanes under computed torque."""
-    loop = {"controller": control, "state": at_rest, "steps": STEPS, "timestep": H}
-    return jg.close_loop(grasp, mug_body, disturbance=push, plant=plant, **loop)
+    run = jg.motion.Simulation(STEPS, H, plant=plant)
+    loop = {"controller": control, "state": at_rest, "simulation": run}
+    return jg.close_loop(grasp, mug_body, disturbance=push, **loop)
 
 
 out = held(on_mug, push)

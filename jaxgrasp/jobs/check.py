@@ -31,6 +31,7 @@ from ..motion import (
     Controllability,
     Gains,
     RigidBody,
+    Simulation,
     close_loop,
     controllability,
     regulator,
@@ -165,11 +166,8 @@ def _disturbed(
         body,
         controller=controller,
         state=start,
-        steps=STEPS,
-        timestep=TIMESTEP,
-        reference=None,
+        simulation=Simulation(STEPS, timestep=TIMESTEP, gravity=gravity),
         disturbance=np.tile(push, (1, n, 1)),
-        gravity=gravity,
     )
     settled = np.asarray(out.settled(position=NEAR, orientation=float(LEVEL)))
     fine = (Status.COMMANDED.value, Status.PROJECTED.value)
