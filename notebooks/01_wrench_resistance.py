@@ -35,7 +35,7 @@ from IPython.display import Image, display
 import jaxgrasp as jg
 from jaxgrasp.objects.builtin import make_object
 from jaxgrasp.objects.sampling import SurfaceSampler
-from jaxgrasp.report.verdict_words import Verdict, draw, explain
+from jaxgrasp.report import Verdict, draw, explain
 
 jax.config.update("jax_enable_x64", True)  # without it JAX computes in float32
 plt.rcParams.update({"figure.dpi": 110, "axes.grid": True, "grid.alpha": 0.3, "font.size": 9})
@@ -265,7 +265,7 @@ escaping = Verdict(
     model="hard",
     status=jg.Status(int(screened.status[row])),
     margin=float(screened.margin[row]),
-    gap=float(screened.gap[row]),
+    upper=float(screened.margin[row] + screened.gap[row]),
     rank=int(screened.rank[row]),
     force=np.asarray(screened.internal_force[row]).reshape(3, 3),
     twist=np.asarray(screened.escape_twist[row]),

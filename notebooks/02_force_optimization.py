@@ -38,7 +38,7 @@ from IPython.display import Image, display
 import jaxgrasp as jg
 from jaxgrasp.objects.builtin import make_object
 from jaxgrasp.objects.sampling import SurfaceSampler
-from jaxgrasp.report.verdict_words import Verdict, draw
+from jaxgrasp.report import Verdict, draw
 
 jax.config.update("jax_enable_x64", True)  # without it JAX computes in float32
 jax.config.update(
@@ -532,7 +532,7 @@ drawn = Verdict(
     model="hard",
     status=jg.Status(int(verdict.status)),
     margin=float(verdict.margin),
-    gap=float(verdict.gap),
+    upper=float(verdict.margin + verdict.gap),
     rank=int(verdict.rank),
     force=f / f[:, 2].mean(),
     twist=None,

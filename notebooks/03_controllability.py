@@ -36,7 +36,7 @@ from IPython.display import Image, display
 import jaxgrasp as jg
 from jaxgrasp.objects.builtin import make_object
 from jaxgrasp.objects.sampling import SurfaceSampler
-from jaxgrasp.report.verdict_words import Verdict, draw
+from jaxgrasp.report import Verdict, draw
 
 jax.config.update("jax_enable_x64", True)  # without it JAX computes in float32
 jax.config.update(
@@ -294,7 +294,7 @@ drawn = Verdict(
     model="hard",
     status=jg.Status(int(verdict.status[0])),
     margin=float(verdict.margin[0]),
-    gap=float(verdict.gap[0]),
+    upper=float(verdict.margin[0] + verdict.gap[0]),
     rank=int(verdict.rank[0]),
     force=np.asarray(forces / forces[:, 2].mean()),
     twist=None,

@@ -1,5 +1,6 @@
 """``jaxgrasp check`` as a user runs it."""
 
+import importlib
 import os
 import signal
 import subprocess
@@ -14,9 +15,9 @@ from quick_check import quick
 
 from jaxgrasp import Status
 from jaxgrasp.cli.main import main
-from jaxgrasp.jobs import motion as checking
 from jaxgrasp.jobs import shards
 
+checking = importlib.import_module("jaxgrasp.jobs.check")  # the room has a function of the same name
 V = Status
 pytestmark = pytest.mark.skipif(not jax.config.jax_enable_x64, reason="the command works in float64")
 
@@ -103,9 +104,9 @@ def test_a_stopped_check_goes_on_where_it_was(capsys, tmp_path, monkeypatch):
 
 
 KILLED = """
-import sys, time
+import importlib, sys, time
 from quick_check import quick
-from jaxgrasp.jobs import motion as checking
+checking = importlib.import_module("jaxgrasp.jobs.check")
 from jaxgrasp.cli.main import main
 def slow(run, contacts):
     time.sleep(0.3)

@@ -22,9 +22,10 @@ from jaxgrasp.core.errors import UserError
 from jaxgrasp.forces.named_criteria import CRITERIA, make_criterion
 from jaxgrasp.formats.parquet import read_metadata
 from jaxgrasp.jobs import forces as loading
-from jaxgrasp.jobs.forces import ForceSummary
-from jaxgrasp.jobs.load import LoadRequest, prepare_load
-from jaxgrasp.report.force_words import ForceAnswer, contact_rows, cost_words, infeasible_words, load_words
+from jaxgrasp.jobs.forces_request import ForcesRequest, plan_forces
+from jaxgrasp.jobs.summary import ForceSummary
+from jaxgrasp.report.answers import ForceAnswer
+from jaxgrasp.report.force_words import contact_rows, cost_words, infeasible_words, load_words
 
 WEIGHT = 0.3 * 9.81
 LOAD = ["--mass", "0.3", "--gravity", "0,0,-1"]
@@ -79,7 +80,7 @@ def as_asked(table, metadata):
         status=table["status"].to_numpy(),
         force=column(table, "force", 3 * k),
         upper=table["cost"].to_numpy(),
-        lower=table["bound"].to_numpy(),
+        lower=table["lower"].to_numpy(),
         escape_twist=column(table, "escape_twist", 6),
         load_twist=column(table, "load_twist", 6),
         joint_rates=np.zeros((n, 0)),
@@ -133,8 +134,8 @@ def test_nulls_and_numbers_fit_the_status(written):
     work = column(written, "escape_twist", 6)[lost] @ [0, 0, -WEIGHT, 0, 0, 0]
     assert (work > 0).all()
     held = status == Status.OPTIMAL
-    cost, bound = written["cost"].to_numpy()[held], written["bound"].to_numpy()[held]
-    assert (bound <= cost).all() and (cost - bound <= 4.1e-8 * np.maximum(cost, WEIGHT)).all()
+    cost, lower = written["cost"].to_numpy()[held], written["lower"].to_numpy()[held]
+    assert (lower <= cost).all() and (cost - lower <= 4.1e-8 * np.maximum(cost, WEIGHT)).all()
 
 
 def test_metadata_say_what_was_asked(folder, screened, dtype):
@@ -267,7 +268,7 @@ def test_an_altered_file_is_found_out(capsys, written):
 
     alterations = (
         (Status.OPTIMAL, "cost", lambda x: 0.999 * x),
-        (Status.OPTIMAL, "bound", lambda x: 1.001 * x),
+        (Status.OPTIMAL, "lower", lambda x: 1.001 * x),
         (Status.OPTIMAL, "load_twist", reverse),
         (Status.INFEASIBLE, "escape_twist", reverse),
     )
@@ -299,7 +300,7 @@ def answer(**changes):
     row = {
         "row": 0, "grasp_id": 0, "position": np.asarray([[-1.0, 0], [1, 0]]), "normal": np.asarray([[1.0, 0], [-1, 0]]),
         "friction": np.full(2, 0.5), "torsion": np.zeros(2), "active": np.ones(2, bool),
-        "status": Status.INFEASIBLE.value, "cost": np.inf, "bound": np.inf, "force": None, "contact_force": None,
+        "status": Status.INFEASIBLE.value, "cost": np.inf, "lower": np.inf, "force": None, "contact_force": None,
         "escape_twist": np.asarray([0.0, -1, 1]) / np.sqrt(2), "load_twist": None,
     }  # fmt: skip
     metadata = {
@@ -365,11 +366,11 @@ def test_words_for_motions_that_nothing_opposes():
 
 def test_costs_carry_their_weights_and_units():
     robust = {"name": "robust", "weight": 0.5, "length": None, "unit": "N"}
-    assert cost_words(answer(criterion=robust, cost=3.0, bound=2.5)) == (
+    assert cost_words(answer(criterion=robust, cost=3.0, lower=2.5)) == (
         "Cost: 3 N (robust, weight 0.5 N: the largest normal force less weight times log det P), at most 5.0e-01 N "
         "above the least there is."
     )
-    assert "no bound is proven" in cost_words(answer(cost=3.0, bound=-np.inf))
+    assert "no bound is proven" in cost_words(answer(cost=3.0, lower=-np.inf))
 
 
 # The request -----------------------------------------------------------------------------------------
@@ -385,14 +386,14 @@ def test_every_criterion_has_its_object():
 
 def test_gravity_is_a_direction_and_g_its_size(screened):
     def wrench(**options):
-        return prepare_load(LoadRequest(screened, mass=2.0, row=3, **options)).load.wrench
+        return plan_forces(ForcesRequest(screened, mass=2.0, row=3, **options)).load.wrench
 
     assert wrench().tolist() == [0, 0, -2 * 9.81, 0, 0, 0]
     assert wrench(gravity=(3.0, 0.0, -4.0), g=10.0) == pytest.approx([12, 0, -16, 0, 0, 0], rel=1e-15)
     assert wrench(gravity=(0.0, -9.81, 0.0)) == pytest.approx([0, -19.62, 0, 0, 0, 0], rel=1e-15)
     jg.save_grasp(jg.Grasp([[-1.0, 0], [1, 0]], [[1.0, 0], [-1, 0]], jg.HardFinger(0.5)), "planar.npz")
-    planar = prepare_load(LoadRequest("planar.npz", mass=1.0))
-    assert planar.load.wrench.tolist() == [0, -9.81, 0] and planar.load.assumed and planar.row == 0
+    planar = plan_forces(ForcesRequest("planar.npz", mass=1.0))
+    assert planar.load.wrench.tolist() == [0, -9.81, 0] and planar.load.assumed and planar.selection.row == 0
 
 
 def a_mesh():
@@ -497,11 +498,11 @@ def test_help_has_examples(capsys):
 def test_stopped_in_the_middle_nothing_is_left(capsys, monkeypatch, screened, error):
     solve, calls = loading._solve, []
 
-    def failing(run, contacts):
+    def failing(plan, contacts):
         calls.append(len(contacts))
         if len(calls) == 4:
             raise error
-        return solve(run, contacts)
+        return solve(plan, contacts)
 
     monkeypatch.setattr(loading, "_solve", failing)
     code = main(["forces", screened, *LOAD, "--chunk", "64", "-o", "stopped.parquet", "--threads", "1"])
@@ -536,9 +537,7 @@ def test_no_thread_outlives_the_64_bits_it_needs(monkeypatch, screened):
 
 
 def test_an_answer_that_is_not_proved_is_counted_as_such(capsys, monkeypatch, screened):
-    monkeypatch.setattr(
-        loading, "check_certificate", lambda grasp, found, _: np.zeros(found.status.shape, bool)
-    )
+    monkeypatch.setattr(loading, "check", lambda grasp, found, **_: np.zeros(found.status.shape, bool))
     assert main(["forces", screened, *LOAD, "-o", "a.parquet"]) == 0
     assert "proved again in float64 without the solver: 0 of " in capsys.readouterr().out
     assert main(["forces", screened, *LOAD, "--row", "0"]) == 0
@@ -551,6 +550,8 @@ def test_a_damaged_file_of_forces(written):
     for name in ("load", "tolerance", "centre_of_mass"):
         with pytest.raises(UserError, match=f"damaged or incomplete .*{name}"):
             ForceAnswer.from_row(row, {key: value for key, value in metadata.items() if key != name})
+    with pytest.raises(UserError, match=r"damaged or incomplete .*gecko"):
+        ForceAnswer.from_row(row, {**metadata, "model": {"kind": "gecko"}})
 
 
 def test_quantiles_of_costs_are_right_to_a_thousandth():

@@ -10,12 +10,13 @@ import pytest
 
 import jaxgrasp as jg
 from jaxgrasp.cli.main import main
-from jaxgrasp.formats.parquet import ContactFile, read_metadata, read_row
+from jaxgrasp.formats import ContactFile, read_metadata, read_row
 from jaxgrasp.placement.requirements import SLACK
 
 # The rooms have functions of the same names.
 cli_place = importlib.import_module("jaxgrasp.cli.place")
 placing = importlib.import_module("jaxgrasp.jobs.place")
+place_request = importlib.import_module("jaxgrasp.jobs.place_request")
 
 pytestmark = pytest.mark.skipif(not jax.config.jax_enable_x64, reason="the command works in float64")
 FEW = [
@@ -99,8 +100,8 @@ def test_explain_reads_the_file(placed, capsys):
 
 def test_the_summary_is_printed(placed, capsys):
     _, _, told = placed
-    run = placing.prepare_place(placing.PlaceRequest("box", starts=24))
-    cli_place._print_summary(cli_place.Console(), run, told)
+    plan = place_request.plan_place(place_request.PlaceRequest("box", starts=24))
+    cli_place._print_summary(plan, told)
     said = capsys.readouterr().out
     held = int(told.placement.resistant.sum())
     assert f"{held} of 24 starts ended wrench resistant ({100 * held / 24:.1f} %)" in said

@@ -5,13 +5,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxgrasp import objects
+from jaxgrasp import objects, report
 from jaxgrasp.core.errors import UserError
 from jaxgrasp.core.geometry import contact_frame
 from jaxgrasp.core.status import Status
-from jaxgrasp.report import drawing
-from jaxgrasp.report import verdict_words as report
-from jaxgrasp.report.verdict_words import Verdict, explain, reprove_verdict
+from jaxgrasp.report import Verdict, drawing, explain, reprove_verdict
 from jaxgrasp.report.words import screw
 
 COM = np.array([0.01, -0.02, 0.03])
@@ -29,7 +27,7 @@ def verdict(**changes):
         "model": "hard",
         "status": Status.NOT_RESISTANT,
         "margin": 1.0,
-        "gap": 0.0,
+        "upper": changes.get("margin", 1.0),
         "rank": 5,
         "force": np.array([[0.0, 0, 1], [0, 0, 1]]),
         "twist": np.array([0.0, 0, 0, 1, 0, 0]),
@@ -99,12 +97,14 @@ def test_a_pinch_that_spins_in_words():
     assert "balance" not in told  # forces are no proof here
 
 
+def test_the_bracket_of_the_margin_in_words():
+    assert "Margin: between 1 and 1.25 (1 is the best" in explain(verdict(upper=1.25))
+
+
 def test_a_slide_in_words():
     normal = np.array([[1.0, 0, 0], [0.8, 0.6, 0]])
     told = explain(
-        verdict(
-            normal=normal, rank=6, margin=-np.inf, gap=0.0, force=None, twist=np.array([1.0, 0, 0, 0, 0, 0])
-        )
+        verdict(normal=normal, rank=6, margin=-np.inf, force=None, twist=np.array([1.0, 0, 0, 0, 0, 0]))
     )
     assert "Margin: -inf" in told and "a slide along (1, 0, 0)" in told
     assert (
@@ -158,7 +158,7 @@ def test_what_is_wrong_with_an_invalid_grasp():
     position[1, 2] = np.nan
     broken = verdict(
         status=Status.INVALID, position=position, normal=np.zeros((2, 3)), friction=np.array([-1.0, 0.5]),
-        margin=np.nan, gap=np.nan, rank=None, force=None, twist=None,
+        margin=np.nan, rank=None, force=None, twist=None,
     )  # fmt: skip
     told = explain(broken)
     for line in (
@@ -183,8 +183,13 @@ def test_stored_evidence_is_proved_again():
 
 
 def test_rows_without_metadata_are_refused():
-    with pytest.raises(UserError, match="screen it again"):
-        Verdict.from_row({"internal_force": None}, {})
+    known = {"centre_of_mass": [0.0] * 3, "model": {"kind": "hard"}}
+    for metadata in ({}, {**known, "model": ["hard"]}, {**known, "model": {"kind": "gecko"}}):
+        with pytest.raises(UserError, match="screen it again"):
+            Verdict.from_row({"internal_force": None}, metadata)
+    for status in (None, 77):
+        with pytest.raises(UserError, match=f"the row's status, {status}, is none"):
+            Verdict.from_row({"status": status}, known)
 
 
 def test_forces_are_drawn_in_the_solver_s_frame():

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from ..core import Status
-from .terminal import ProgressBar, numbers, say
+from .. import jobs
+from ..backend import precision, remember_compilations, usable_backend
+from ..core import Status, UserError
+from ..formats import read_check_columns
+from ..jobs import CheckPlan, CheckRequest, controllability_of, plan_check
+from ..report import explain_controllability, status_words
+from .options import Vector, options
+from .terminal import ProgressBar, line, resumable, say
 
 __all__ = ["CHECK_HELP", "check"]
 
@@ -31,77 +36,60 @@ Examples:
 """
 
 
-def check(
-    source: Annotated[
-        str, typer.Argument(metavar="SOURCE", help="Parquet file of grasps, mesh file, or built-in object.")
-    ],
-    mass: Annotated[float, typer.Option(metavar="KG", help="The object's mass; its inertia is the mesh's.")],
-    gravity: Annotated[
-        str, typer.Option(metavar="X,Y,Z", help="Gravity in m/s^2, in the mesh's frame.")
-    ] = "0,0,-9.81",
-    most: Annotated[int, typer.Option(help="Check at most this many grasps, the first ones.")] = 256,
-    chunk: Annotated[int, typer.Option(help="Grasps checked together; memory grows with it.")] = 256,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with an unfinished run of the same options.")
-    ] = False,
-    row: Annotated[int | None, typer.Option("--row", help="Say this row in words, too.")] = None,
-    fingers: Annotated[
-        int | None, typer.Option("--fingers", "-k", help="Of sampled grasps (default: 4).")
-    ] = None,
-    model: Annotated[str | None, typer.Option(help="hard, soft or frictionless (default: hard).")] = None,
-    friction: Annotated[float | None, typer.Option(help="Coulomb coefficient mu (default: 0.5).")] = None,
-    torsion: Annotated[
-        float | None, typer.Option(help="gamma in m of a soft finger (default: 0.01).")
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Of sampled grasps.")] = 0,
-    unit: Annotated[str, typer.Option(help="Unit of the mesh file's numbers: m, cm, mm or in.")] = "m",
-    object: Annotated[
-        str | None, typer.Option("--object", help="The mesh, if it is not where the run found it.")
-    ] = None,
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Parquet file (default: SOURCE.check.parquet).")
-    ] = None,
-) -> None:
-    from ..backend import precision, remember_compilations, usable_backend
-    from ..core import UserError
-    from ..jobs import CheckRequest, Request, checked_columns, controllability_of, prepare_check
-    from ..jobs import check as start
-    from ..report import explain_controllability
+CHECK_OPTIONS = {
+    "source": typer.Argument(metavar="SOURCE", help="Parquet file of grasps, mesh file, or built-in object."),
+    "mass": typer.Option(metavar="KG", help="The object's mass; its inertia is the mesh's."),
+    "gravity": Vector(
+        typer.Option(metavar="X,Y,Z", help="Gravity in m/s^2, in the mesh's frame."),
+        (3,),
+        "three numbers x,y,z in m/s^2 without spaces, such as 0,0,-9.81",
+    ),
+    "most": typer.Option(help="Check at most this many grasps, the first ones."),
+    "chunk": typer.Option(help="Grasps checked together; memory grows with it."),
+    "resume": typer.Option("--resume", help="Go on with an unfinished run of the same options."),
+    "row": typer.Option("--row", help="Say this row in words, too."),
+    "fingers": typer.Option("--fingers", "-k", help="Of sampled grasps (default: 4)."),
+    "model": typer.Option(help="hard, soft or frictionless (default: hard)."),
+    "friction": typer.Option(help="Coulomb coefficient mu (default: 0.5)."),
+    "torsion": typer.Option(help="gamma in m of a soft finger (default: 0.01)."),
+    "seed": typer.Option(help="Of sampled grasps."),
+    "unit": typer.Option(help="Unit of the mesh file's numbers: m, cm, mm or in."),
+    "object": typer.Option("--object", help="The mesh, if it is not where the run found it."),
+    "output": typer.Option("--output", "-o", help="Parquet file (default: SOURCE.check.parquet)."),
+}
 
-    down = numbers(
-        gravity, "--gravity", (3,), "three numbers x,y,z in m/s^2 without spaces, such as 0,0,-9.81"
-    )
-    assert down is not None
+
+@options(CheckRequest, CHECK_OPTIONS)
+def check(request: CheckRequest, resume: bool = False, row: int | None = None) -> None:
     usable_backend(say)
     remember_compilations()
-    grasps = Request(
-        source, None, fingers, model, friction, torsion, seed=seed, unit=unit, chunk=min(chunk, most)
-    )
     with precision("float64"):
-        run = prepare_check(CheckRequest(grasps, mass, (down[0], down[1], down[2]), object, most, output))
-        for warning in run.warnings:
+        plan = plan_check(request)
+        for warning in plan.warnings:
             say(f"warning: {warning}")
-        if row is not None and not 0 <= row < run.count:
-            raise UserError(f"rows 0 to {run.count - 1} are checked, there is no row {row}; see --most")
-        try:
-            with ProgressBar(Console(stderr=True), run.count, Status.RESISTANT, "reading") as bar:
-                summary = start(run, resume, bar.show)
-        except KeyboardInterrupt:
-            again = "" if resume else " and --resume"
-            say(f"stopped; the finished part is in {run.output}.parts: go on with the same command{again}")
-            raise
-        found = None if row is None else controllability_of(run, row)
-    console, columns = Console(), checked_columns(run.output)
-    console.print(_counts(columns, f"{Path(source).name}: {run.count:,} grasps"))
+        if row is not None and not 0 <= row < plan.count:
+            raise UserError(f"rows 0 to {plan.count - 1} are checked, there is no row {row}; see --most")
+        with (
+            resumable(plan.output, resume),
+            ProgressBar(Console(stderr=True), plan.count, Status.RESISTANT, "reading") as bar,
+        ):
+            summary = jobs.check(plan, resume, bar.show)
+        found = None if row is None else controllability_of(plan, row)
+    _print_summary(plan, Path(request.source).name)
+    if found is not None:
+        words = explain_controllability(found, 0, plan.grasps.candidates.centre_of_mass)
+        line(f"Row {row}: {words}")
+    if summary.resumed:
+        Console().print(f"{summary.resumed:,} grasps were already done", highlight=False)
+    line(f"written to {plan.output}")
+
+
+def _print_summary(plan: CheckPlan, name: str) -> None:
+    console, columns = Console(), read_check_columns(plan.output)
+    console.print(_counts(columns, f"{name}: {plan.count:,} grasps"))
     back = columns["recovered"]
     if back.any():
         console.print(_worst(columns, back))
-    if found is not None:
-        words = explain_controllability(found, 0, run.run.centre_of_mass)
-        console.print(f"Row {row}: {words}", highlight=False, soft_wrap=True, markup=False)
-    if summary.resumed:
-        console.print(f"{summary.resumed:,} grasps were already done", highlight=False)
-    console.print(f"written to {run.output}", highlight=False, soft_wrap=True, markup=False)
 
 
 # The answers of a check, best first.
@@ -127,9 +115,11 @@ def _counts(columns: dict[str, np.ndarray], title: str) -> Table:
         if here.any():
             back = int(columns["recovered"][here].sum())
             known = verdict in (Status.RESISTANT, Status.CONTROLLABLE)
-            words = verdict.name.replace("_", " ").lower()
             table.add_row(
-                words, f"{here.sum():,}", f"{100 * here.sum() / total:.2f} %", f"{back:,}" if known else ""
+                status_words(verdict),
+                f"{here.sum():,}",
+                f"{100 * here.sum() / total:.2f} %",
+                f"{back:,}" if known else "",
             )
     return table
 

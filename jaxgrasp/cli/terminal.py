@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
 
 from rich.console import Console
 from rich.progress import (
@@ -15,10 +18,11 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from ..core import Status, UserError
+from ..core import Status
 from ..jobs import Summary
+from ..report import status_words
 
-__all__ = ["ProgressBar", "counts", "numbers", "quantiles", "say", "speed"]
+__all__ = ["ProgressBar", "counts", "line", "quantiles", "resumable", "say", "speed"]
 
 QUANTILES = (
     ("min", 0.0),
@@ -36,17 +40,20 @@ def say(text: str) -> None:
     print(f"jaxgrasp: {' '.join(str(text).split())}", file=sys.stderr)
 
 
-def numbers(text: str | None, option: str, sizes: tuple[int, ...], means: str) -> tuple[float, ...] | None:
-    """``text`` as numbers apart by commas, as many as one of ``sizes``; None stays None."""
-    if text is None:
-        return None
+def line(text: str) -> None:
+    """One line on stdout, as it is."""
+    Console().print(text, highlight=False, soft_wrap=True, markup=False)
+
+
+@contextmanager
+def resumable(output: Path, resumed: bool) -> Generator[None]:
+    """Ctrl-C in the middle of a run of shards: one line says how to go on."""
     try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        values = ()
-    if len(values) not in sizes:
-        raise UserError(f"{option} must be {means}, got {text!r}")
-    return values
+        yield
+    except KeyboardInterrupt:
+        again = "" if resumed else " and --resume"
+        say(f"stopped; the finished part is in {output}.parts: go on with the same command{again}")
+        raise
 
 
 class ProgressBar:
@@ -97,8 +104,9 @@ def counts(summary: Summary, title: str, head: str) -> Table:
     table.add_column("share", justify="right")
     for status in Status:
         if summary.counts.get(status):
-            words = status.name.replace("_", " ").lower()
-            table.add_row(words, f"{summary.counts[status]:,}", f"{100 * summary.share(status):.2f} %")
+            table.add_row(
+                status_words(status), f"{summary.counts[status]:,}", f"{100 * summary.share(status):.2f} %"
+            )
     for reason, number in summary.removed.items():
         table.add_row(f"left out by --filter: {reason}", f"{number:,}", "")
     return table

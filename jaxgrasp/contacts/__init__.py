@@ -13,7 +13,17 @@ from .grasp_map import (
     length_scale,
     null_space,
 )
-from .models import MODELS, Component, ContactModel, Frictionless, HardFinger, SoftFinger
+from .models import (
+    MODELS,
+    Component,
+    ContactModel,
+    Frictionless,
+    HardFinger,
+    SoftFinger,
+    component_names,
+    contact_model,
+    model_name,
+)
 from .projection import (
     Projection,
     Tile,
@@ -48,7 +58,9 @@ __all__ = [
     "Projection",
     "SoftFinger",
     "Tile",
+    "component_names",
     "cone_use",
+    "contact_model",
     "contacts_of",
     "filled",
     "fold",
@@ -62,6 +74,7 @@ __all__ = [
     "length_scale",
     "masked",
     "minus_transposed",
+    "model_name",
     "nearest_admissible",
     "normal_first",
     "normalized",

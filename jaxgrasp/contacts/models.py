@@ -19,7 +19,17 @@ import jax.numpy as jnp
 
 from ..core import Array, Float, real_array
 
-__all__ = ["Component", "ContactModel", "Frictionless", "HardFinger", "MODELS", "SoftFinger"]
+__all__ = [
+    "Component",
+    "ContactModel",
+    "Frictionless",
+    "HardFinger",
+    "MODELS",
+    "SoftFinger",
+    "component_names",
+    "contact_model",
+    "model_name",
+]
 
 
 class Component(Enum):
@@ -257,4 +267,24 @@ class SoftFinger(ContactModel):
         return _where_rough(mu, 2, 1), _where_rough(mu, 1, 0), jnp.zeros_like(mu)
 
 
-MODELS = {"hard": HardFinger, "soft": SoftFinger, "frictionless": Frictionless}
+# What files and the command line call them.
+MODELS: dict[str, type[ContactModel]] = {"hard": HardFinger, "soft": SoftFinger, "frictionless": Frictionless}
+
+
+def contact_model(name: str, friction: Any, torsion: Any) -> ContactModel:
+    """The model of this name in ``MODELS`` with mu and gamma (m) per contact; those it does not have are left out."""
+    return MODELS[name]().with_coefficients(jnp.asarray(friction), jnp.asarray(torsion))
+
+
+def model_name(model: ContactModel) -> str:
+    """The name of ``model`` in ``MODELS``; ValueError for a model that has none."""
+    for name, kind in MODELS.items():
+        if type(model) is kind:
+            return name
+    known = ", ".join(sorted(kind.__name__ for kind in MODELS.values()))
+    raise ValueError(f"the contact model {type(model).__name__} has no name; known models: {known}")
+
+
+def component_names(name: str, dimension: int) -> tuple[str, ...]:
+    """The symbols of the force components of the model of this name, such as ("f_x", "f_y", "f_n")."""
+    return tuple(component.value for component in MODELS[name]().components(dimension))

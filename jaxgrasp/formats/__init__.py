@@ -1,11 +1,24 @@
-"""Grasp sets in and out, one file a format."""
+"""Grasp sets in and out, one file a format: our Parquet tables of verdicts, forces and checks, contacts, one grasp."""
 
-from .force_table import Forces, GraspFile, as_row, force_schema, force_table, read_force_row
-from .grasp_npz import load_grasp, save_grasp
-from .parquet import ContactFile, Contacts, Verdicts, dump, read_metadata, read_row, schema, table, write
-from .saved_grasp import SavedGrasps
+from .check_table import check_schema, check_table, read_check_columns
+from .contact_file import ContactFile, GraspFile
+from .force_table import Forces, force_schema, force_table, read_force_row
+from .npz import SavedGrasps, load_grasp, save_grasp
+from .parquet import (
+    METADATA_KEY,
+    Contacts,
+    Verdicts,
+    as_row,
+    dump_metadata,
+    read_metadata,
+    read_row,
+    verdict_schema,
+    verdict_table,
+    write,
+)
 
 __all__ = [
+    "METADATA_KEY",
     "ContactFile",
     "Contacts",
     "Forces",
@@ -13,15 +26,18 @@ __all__ = [
     "SavedGrasps",
     "Verdicts",
     "as_row",
-    "dump",
+    "check_schema",
+    "check_table",
+    "dump_metadata",
     "force_schema",
     "force_table",
     "load_grasp",
+    "read_check_columns",
     "read_force_row",
     "read_metadata",
     "read_row",
     "save_grasp",
-    "schema",
-    "table",
+    "verdict_schema",
+    "verdict_table",
     "write",
 ]

@@ -1,30 +1,36 @@
-"""Long work on many grasps: requests checked before any work, executors in chunks, shards, summaries."""
+"""Long work on many grasps: requests checked before any work (``plan_*``), executors in chunks, shards, summaries."""
 
-from .forces import balance_many, balance_one
-from .load import LoadRequest, prepare_load
-from .motion import CheckRequest, check, checked_columns, controllability_of, prepare_check
-from .place import PlaceRequest, draw_best, place, prepare_place
-from .request import Request, prepare_screen, provenance
+from .check import check, controllability_of
+from .check_request import CheckPlan, CheckRequest, plan_check
+from .forces import forces_of_file, forces_of_row
+from .forces_request import ForcesPlan, ForcesRequest, plan_forces
+from .place import Placed, draw_best, place
+from .place_request import PlacePlan, PlaceRequest, plan_place
 from .screen import screen
-from .summary import Summary
+from .screen_request import ScreenPlan, ScreenRequest, plan_screen
+from .summary import ForceSummary, Summary
 
 __all__ = [
+    "CheckPlan",
     "CheckRequest",
-    "LoadRequest",
+    "ForceSummary",
+    "ForcesPlan",
+    "ForcesRequest",
+    "PlacePlan",
     "PlaceRequest",
-    "Request",
+    "Placed",
+    "ScreenPlan",
+    "ScreenRequest",
     "Summary",
-    "balance_many",
-    "balance_one",
     "check",
-    "checked_columns",
     "controllability_of",
     "draw_best",
+    "forces_of_file",
+    "forces_of_row",
     "place",
-    "prepare_check",
-    "prepare_load",
-    "prepare_place",
-    "prepare_screen",
-    "provenance",
+    "plan_check",
+    "plan_forces",
+    "plan_place",
+    "plan_screen",
     "screen",
 ]

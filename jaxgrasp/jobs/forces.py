@@ -6,12 +6,11 @@ is whole. There is nothing to resume: a million grasps take less time than compi
 
 from __future__ import annotations
 
+import functools
 import time
-from collections import deque
 from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -21,71 +20,24 @@ import pyarrow as pa
 
 from ..backend import precision
 from ..certificates import check
-from ..contacts import Component, Grasp
+from ..contacts import Component, Grasp, contact_model
 from ..core import Status, UserError, contact_frame, normalize
 from ..forces import OptimalForces, closeness, optimize_forces
 from ..formats import Contacts, Forces, as_row, force_schema, force_table, write
-from .load import LoadRun
-from .summary import Summary
+from .forces_request import ForcesPlan
+from .summary import ForceSummary
+from .threads import in_order
 
-__all__ = ["ForceSummary", "balance_many", "balance_one"]
-
-FINEST, LARGEST, STEP = 1e-9, 1e15, 1e-3  # costs are told apart to STEP relative, near 0 to FINEST STEP
-HALF = int(np.arcsinh(LARGEST / FINEST) / STEP) + 1
-BINS = 2 * HALF + 1
+__all__ = ["forces_of_file", "forces_of_row"]
 
 
-@dataclass
-class ForceSummary(Summary):
-    """Counts by status, and the costs of the optimal grasps, in a size that does not depend on how many they are.
-
-    Costs c go into bins of ``asinh(c / FINEST)`` of width STEP, so a quantile is right to 0.05 %. ``proved``: optimal
-    and infeasible answers that the checker accepted.
-    """
-
-    histogram: np.ndarray = field(default_factory=lambda: np.zeros(BINS, np.int64))
-    proved: int = 0
-
-    @classmethod
-    def of_costs(cls, status: np.ndarray, cost: np.ndarray, proved: np.ndarray) -> ForceSummary:
-        """The summary of these rows."""
-        values, numbers = np.unique(status, return_counts=True)
-        counts = {Status(int(v)): int(n) for v, n in zip(values, numbers, strict=True)}
-        known = cost[(status == Status.OPTIMAL.value) & np.isfinite(cost)]
-        place = np.rint(np.arcsinh(np.clip(known, -LARGEST, LARGEST) / FINEST) / STEP).astype(np.int64)
-        histogram = np.bincount(place + HALF, minlength=BINS)
-        return cls(counts=counts, histogram=histogram, solved=len(status), proved=int(proved.sum()))
-
-    def add(self, other: Summary) -> None:
-        """Take the rows of ``other`` in as well."""
-        super().add(other)
-        if isinstance(other, ForceSummary):
-            self.proved += other.proved
-
-    def quantile(self, q: float) -> float:
-        """The cost that a share q of the optimal grasps lie at or below; NaN if there are none."""
-        number = int(self.histogram.sum())
-        if not number:
-            return float("nan")
-        rank = min(max(q * number, 1), number)
-        place = int(np.searchsorted(np.cumsum(self.histogram), rank, side="left"))
-        return float(FINEST * np.sinh((place - HALF) * STEP))
-
-
-def _padded(contacts: Contacts, rows: int) -> Contacts:
-    """With lanes of inactive contacts up to ``rows``, so that every chunk has one shape; they end at once."""
-    parts = []
-    for name in Contacts.__dataclass_fields__:
-        value = getattr(contacts, name)
-        full = np.zeros((rows, *value.shape[1:]), value.dtype if value.dtype == bool else np.float64)
-        full[: len(contacts)] = value
-        parts.append(full)
-    return Contacts(*parts)
-
-
-def _grasp(run: LoadRun, contacts: Contacts) -> Grasp:
-    model = run.model.with_coefficients(jnp.asarray(contacts.friction), jnp.asarray(contacts.torsion))
-    return Grasp(contacts.position - run.centre_of_mass, contacts.normal, model, contacts.active)
+def _grasp(plan: ForcesPlan, contacts: Contacts) -> Grasp:
+    """In float64, at the centre of mass, padded to the chunk."""
+    full = contacts.padded(plan.chunk)
+    values = (full.position, full.normal, full.friction, full.torsion)
+    position, normal, friction, torsion = (np.asarray(value, np.float64) for value in values)
+    model = contact_model(plan.source.kind, friction, torsion)
+    return Grasp(position - plan.source.centre_of_mass, normal, model, full.active)
 
 
 def _in_mesh_axes(grasp: Grasp, force: jax.Array) -> np.ndarray:
@@ -108,117 +60,104 @@ class _Solved:
     seconds: float  # in the solver
 
 
-def _solve(run: LoadRun, contacts: Contacts) -> _Solved:
-    count = len(contacts)
-    grasp = _grasp(run, _padded(contacts, run.chunk))
+def _solve(plan: ForcesPlan, contacts: Contacts) -> _Solved:
+    count, request = len(contacts), plan.request
+    grasp = _grasp(plan, contacts)
     started = time.perf_counter()
     found: OptimalForces = jax.block_until_ready(
         optimize_forces(
             grasp,
-            jnp.asarray(run.load.wrench),
-            criterion=run.criterion,
-            max_normal=run.max_normal,
-            tolerance=run.tolerance,
+            jnp.asarray(plan.load.wrench),
+            criterion=plan.criterion,
+            max_normal=request.max_normal,
+            tolerance=request.tolerance,
         )
     )
     seconds = time.perf_counter() - started
-    values: dict[str, Any] = {
-        name: np.asarray(getattr(found, {"bound": "lower"}.get(name, name)))[:count]
-        for name in Forces.__dataclass_fields__
-        if name != "contact_force"
-    }
-    values["contact_force"] = _in_mesh_axes(grasp, found.force)[:count]
-    claims = np.isin(values["status"], (Status.OPTIMAL.value, Status.INFEASIBLE.value))
+    forces = Forces.of(found, _in_mesh_axes(grasp, found.force), count)
+    claims = np.isin(forces.status, (Status.OPTIMAL.value, Status.INFEASIBLE.value))
     proved = check(
         grasp,
         found,
-        wrench=run.load.wrench,
-        criterion=run.criterion,
-        max_normal=run.max_normal,
-        tolerance=closeness(run.tolerance),
+        wrench=plan.load.wrench,
+        criterion=plan.criterion,
+        max_normal=request.max_normal,
+        tolerance=closeness(request.tolerance),
     )
-    proved = claims & proved[:count]
-    return _Solved(Forces(**values), proved, seconds)
+    return _Solved(forces, claims & proved[:count], seconds)
 
 
-def _nothing(run: LoadRun) -> Contacts:
+def _nothing(plan: ForcesPlan) -> Contacts:
     """No grasps, in the right shapes: compiles everything, solves nothing."""
-    k, d = run.fingers, run.dimension
+    k, d = plan.source.fingers, plan.source.dimension
     shapes: list[tuple[int, ...]] = [(0,), (0, k, d), (0, k, d), (0, k), (0, k)]
     return Contacts(*(np.zeros(shape) for shape in shapes), active=np.zeros((0, k), bool))
 
 
-def balance_one(run: LoadRun) -> tuple[dict[str, Any], bool]:
-    """The one grasp of ``run`` as a row of the file, written too where ``run.output`` is named; is it proved?"""
-    kind = force_schema(run.fingers, run.dimension, run.metadata)
+def _schema(plan: ForcesPlan) -> pa.Schema:
+    return force_schema(plan.source.fingers, plan.source.dimension, plan.metadata)
+
+
+def forces_of_row(plan: ForcesPlan) -> tuple[dict[str, Any], bool]:
+    """The one grasp of ``plan`` as a row of the file, written too where ``plan.output`` is named; is it proved?"""
+    kind = _schema(plan)
     with precision("float64"):
-        rows, contacts = next(iter(run.chunks()))
-        solved = _solve(run, contacts)
+        rows, contacts = next(iter(plan.chunks()))
+        solved = _solve(plan, contacts)
     found = force_table(rows, contacts, solved.forces, kind)
-    if run.output is not None:
-        _write(run, [found], kind)
+    if plan.output is not None:
+        _write(plan, [found], kind)
     return as_row(found), bool(solved.proved[0])
 
 
-def balance_many(run: LoadRun, progress: Callable[[ForceSummary], None] | None = None) -> ForceSummary:
-    """The forces of all grasps of ``run``, written to ``run.output``; the counts, quantiles and times of it.
+def forces_of_file(plan: ForcesPlan, progress: Callable[[ForceSummary], None] | None = None) -> ForceSummary:
+    """The forces of all grasps of ``plan``, written to ``plan.output``; the counts, quantiles and times of it.
 
     progress  called with the running summary before the first chunk and after every chunk
 
     Raises UserError where the output cannot be written. However it ends, no half-written file is left.
     """
-    assert run.output is not None
     tell = progress or (lambda _: None)
-    total = ForceSummary(run.rows)
-    kind = force_schema(run.fingers, run.dimension, run.metadata)
+    total = ForceSummary(plan.selection.count)
+    kind = _schema(plan)
     with precision("float64"):
         tell(total)
         started = time.perf_counter()
-        _solve(run, _nothing(run))
+        _solve(plan, _nothing(plan))
         total.compile_seconds = time.perf_counter() - started
         started = time.perf_counter()
+
+        def told(part: ForceSummary) -> None:
+            total.add(part)
+            total.seconds = time.perf_counter() - started
+            tell(total)
+
         # Closed before 64-bit arrays are switched off again: its threads still work on them.
-        with closing(_tables(run, kind, total, started, tell)) as tables:
-            _write(run, tables, kind)
+        with closing(_tables(plan, kind, told)) as tables:
+            _write(plan, tables, kind)
         total.seconds = time.perf_counter() - started
     return total
 
 
-def _write(run: LoadRun, rows: Iterable[pa.Table], kind: pa.Schema) -> None:
-    assert run.output is not None
+def _write(plan: ForcesPlan, rows: Iterable[pa.Table], kind: pa.Schema) -> None:
+    assert plan.output is not None
     try:
-        write(run.output, rows, kind)
+        write(plan.output, rows, kind)
     except OSError as error:
-        raise UserError(f"cannot write {run.output}: {error.strerror or error}") from error
+        raise UserError(f"cannot write {plan.output}: {error.strerror or error}") from error
 
 
-def _tables(
-    run: LoadRun, kind: pa.Schema, total: ForceSummary, started: float, tell: Callable[[ForceSummary], None]
-) -> Generator[pa.Table]:
-    """The chunks' tables in order, ``run.threads`` chunks worked on at a time; adds them to ``total``."""
-    pending: deque[Future[tuple[pa.Table, ForceSummary]]] = deque()
+def _tables(plan: ForcesPlan, kind: pa.Schema, tell: Callable[[ForceSummary], None]) -> Generator[pa.Table]:
+    """The chunks' tables in order, ``plan.threads`` chunks worked on at a time; ``tell`` hears of each."""
 
     def work(rows: np.ndarray, contacts: Contacts) -> tuple[pa.Table, ForceSummary]:
-        solved = _solve(run, contacts)
+        solved = _solve(plan, contacts)
         summary = ForceSummary.of_costs(solved.forces.status, solved.forces.cost, solved.proved)
-        summary.solve_seconds = solved.seconds / run.threads
+        summary.solve_seconds = solved.seconds / plan.threads
         return force_table(rows, contacts, solved.forces, kind), summary
 
-    def finished() -> pa.Table:
-        found, summary = pending.popleft().result()
-        total.add(summary)
-        total.seconds = time.perf_counter() - started
-        tell(total)
-        return found
-
-    with ThreadPoolExecutor(run.threads) as pool:
-        try:
-            for rows, contacts in run.chunks():
-                pending.append(pool.submit(work, rows, contacts))
-                if len(pending) > run.threads:
-                    yield finished()
-            while pending:
-                yield finished()
-        except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
+    tasks = (functools.partial(work, rows, contacts) for rows, contacts in plan.chunks())
+    with closing(in_order(tasks, plan.threads)) as results:
+        for found, summary in results:
+            tell(summary)
+            yield found

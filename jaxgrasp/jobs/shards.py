@@ -20,16 +20,19 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ..core import UserError
-from ..formats import dump, write
+from ..formats import METADATA_KEY, dump_metadata, write
 
 __all__ = ["Shards"]
 
-KEY, SHARD_KEY = b"jaxgrasp", b"jaxgrasp.shard"
+SHARD_KEY = b"jaxgrasp.shard"
 
 
 @dataclass(frozen=True)
 class Shards:
-    """The shards of one run. ``fingerprint``: ``dump`` of the metadata that identify it, which its file carries."""
+    """The shards of one run.
+
+    fingerprint  ``dump_metadata`` of the metadata that identify the run, which its file carries
+    """
 
     output: Path
     fingerprint: bytes
@@ -85,7 +88,7 @@ class Shards:
 
     def write(self, number: int, rows: pa.Table, about: dict[str, Any]) -> None:
         """Keep the rows of chunk ``number``; ``about``: its start and stop, and what else is to be known of it."""
-        own = {KEY: self.fingerprint, SHARD_KEY: json.dumps(about, sort_keys=True).encode()}
+        own = {METADATA_KEY: self.fingerprint, SHARD_KEY: json.dumps(about, sort_keys=True).encode()}
         _write(self._path(number), rows.replace_schema_metadata(own))
 
     def read(self, number: int, start: int, stop: int) -> tuple[pa.Table, dict[str, Any]] | None:
@@ -94,7 +97,10 @@ class Shards:
             rows = _read(self._path(number))
             metadata = rows.schema.metadata or {}
             about = json.loads(metadata.get(SHARD_KEY, b"{}"))
-            if metadata.get(KEY) != self.fingerprint or (about["start"], about["stop"]) != (start, stop):
+            if metadata.get(METADATA_KEY) != self.fingerprint or (about["start"], about["stop"]) != (
+                start,
+                stop,
+            ):
                 return None
         except (OSError, pa.ArrowException, ValueError, KeyError):
             return None
@@ -111,11 +117,11 @@ class Shards:
         if self.folder.exists():
             return None
         try:
-            metadata = json.loads((pq.read_schema(self.output).metadata or {})[KEY])
+            metadata = json.loads((pq.read_schema(self.output).metadata or {})[METADATA_KEY])
         except (OSError, pa.ArrowException, ValueError, KeyError):
             return None
         identity = {name: value for name, value in metadata.items() if name not in extra}
-        return metadata if dump(identity) == self.fingerprint else None
+        return metadata if dump_metadata(identity) == self.fingerprint else None
 
     def _path(self, number: int) -> Path:
         return self.folder / f"{number:08d}.arrow"

@@ -1,6 +1,6 @@
-"""Counts and margins of many verdicts in a size that does not depend on how many they are.
+"""Counts of many answers, and quantiles of their margins or costs, in a size that does not depend on how many they are.
 
-Quantiles come from a histogram over ``u = s / (1 + s)``, s = 1 - margin >= 0, in ``BINS`` equal steps: a
+Quantiles of margins come from a histogram over ``u = s / (1 + s)``, s = 1 - margin >= 0, in ``BINS`` equal steps: a
 quantile is right to ``(1 + s)^2 / (2 BINS)``, 3e-5 at margin 0. Histograms add up, so the order of chunks
 does not matter.
 """
@@ -13,9 +13,12 @@ import numpy as np
 
 from ..core import Status
 
-__all__ = ["Summary"]
+__all__ = ["ForceSummary", "Summary"]
 
 BINS = 65536
+FINEST, LARGEST, STEP = 1e-9, 1e15, 1e-3  # costs are told apart to STEP relative, near 0 to FINEST STEP
+HALF = int(np.arcsinh(LARGEST / FINEST) / STEP) + 1
+COST_BINS = 2 * HALF + 1
 
 
 @dataclass
@@ -85,3 +88,40 @@ class Summary:
         place = int(np.searchsorted(ranks, min(max((1 - q) * number, 1), number), side="left"))
         u = (place + 0.5) / BINS if place < BINS else 1.0
         return 1 - u / (1 - u) if u < 1 else float("-inf")
+
+
+@dataclass
+class ForceSummary(Summary):
+    """Counts by status, and the costs of the optimal grasps, in a size that does not depend on how many they are.
+
+    Costs c go into bins of ``asinh(c / FINEST)`` of width STEP, so a quantile is right to 0.05 %. ``proved``: optimal
+    and infeasible answers that the checker accepted.
+    """
+
+    histogram: np.ndarray = field(default_factory=lambda: np.zeros(COST_BINS, np.int64))
+    proved: int = 0
+
+    @classmethod
+    def of_costs(cls, status: np.ndarray, cost: np.ndarray, proved: np.ndarray) -> ForceSummary:
+        """The summary of these rows."""
+        values, numbers = np.unique(status, return_counts=True)
+        counts = {Status(int(v)): int(n) for v, n in zip(values, numbers, strict=True)}
+        known = cost[(status == Status.OPTIMAL.value) & np.isfinite(cost)]
+        place = np.rint(np.arcsinh(np.clip(known, -LARGEST, LARGEST) / FINEST) / STEP).astype(np.int64)
+        histogram = np.bincount(place + HALF, minlength=COST_BINS)
+        return cls(counts=counts, histogram=histogram, solved=len(status), proved=int(proved.sum()))
+
+    def add(self, other: Summary) -> None:
+        """Take the rows of ``other`` in as well."""
+        super().add(other)
+        if isinstance(other, ForceSummary):
+            self.proved += other.proved
+
+    def quantile(self, q: float) -> float:
+        """The cost that a share q of the optimal grasps lie at or below; NaN if there are none."""
+        number = int(self.histogram.sum())
+        if not number:
+            return float("nan")
+        rank = min(max(q * number, 1), number)
+        place = int(np.searchsorted(np.cumsum(self.histogram), rank, side="left"))
+        return float(FINEST * np.sinh((place - HALF) * STEP))

@@ -1,8 +1,12 @@
 """Answers as people read them: verdicts, forces and motions in words and pictures."""
 
+from .answers import ForceAnswer, Verdict
 from .controllability_words import explain_controllability
-from .force_words import ForceAnswer, contact_rows, cost_words, infeasible_words, load_words, reprove_forces
-from .verdict_words import Verdict, draw, explain, reprove_verdict
+from .drawing import draw
+from .force_words import contact_rows, cost_words, infeasible_words, load_words
+from .proofs import reprove_forces, reprove_verdict
+from .verdict_words import explain
+from .words import status_words
 
 __all__ = [
     "ForceAnswer",
@@ -16,4 +20,5 @@ __all__ = [
     "load_words",
     "reprove_forces",
     "reprove_verdict",
+    "status_words",
 ]

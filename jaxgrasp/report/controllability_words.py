@@ -6,32 +6,11 @@ import numpy as np
 
 from ..core import Status
 from ..motion import Controllability, Linearization
-from .words import screw, vector
+from .words import motion_words
 
-__all__ = ["explain_controllability", "motion_words"]
+__all__ = ["explain_controllability"]
 
 V = Status
-
-
-def motion_words(twist: np.ndarray, centre_of_mass: np.ndarray, size: float) -> str:
-    """A twist (m,) at the centre of mass as a motion, positions in m in the axes of ``centre_of_mass`` (d,)."""
-    planar = len(centre_of_mass) == 2
-    if planar:  # the plane z = 0
-        twist = np.array([twist[0], twist[1], 0, 0, 0, twist[2]])
-    com = np.concatenate([centre_of_mass, np.zeros(3 - len(centre_of_mass))])
-    motion = screw(twist, com, size)
-    if motion.point is None:
-        return f"a slide along {vector(motion.direction[: len(centre_of_mass)])}"
-    offset = float(np.linalg.norm(motion.point - com))
-    where = (
-        "the centre of mass" if offset <= 1e-6 * size else f"{vector(motion.point[: len(centre_of_mass)])} m"
-    )
-    if planar:
-        return f"a rotation about {where}"
-    words = f"a rotation about the axis along {vector(motion.direction)} through {where}"
-    if motion.pitch:
-        words += f", advancing {1000 * motion.pitch * np.pi / 180:.3g} mm along it with each degree"
-    return words
 
 
 def explain_controllability(
@@ -62,7 +41,7 @@ def explain_controllability(
     )
     size = 0.05 if size is None else size
     if reduced < m:
-        motion = motion_words(at("uncontrollable"), com, size)
+        motion = motion_words(at("uncontrollable"), com, size, distance=False)
         left = m - reduced
         many = "" if left == 1 else f" (one of {left} independent ones)"
         lines.append(f"Out of reach{many}: {motion}.")

@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..core import UserError, contact_frame
+from ..core import Status, UserError, contact_frame
+from .answers import Verdict
+from .words import Screw, screw, status_words
 
 if TYPE_CHECKING:
     import trimesh
 
-    from .verdict_words import Verdict
-    from .words import Screw
-
-__all__ = ["moved", "picture", "view_of"]
+__all__ = ["draw", "moved", "view_of"]
 
 LIGHT = np.array([0.3, -0.5, 0.81])
 BODY, CONTACT, FORCE, ESCAPE = (0.62, 0.68, 0.75), "#d1495b", "#00798c", "#edae49"
@@ -91,8 +90,13 @@ def _cone(axes, point, normal, friction, length) -> None:
     axes.add_collection3d(Poly3DCollection(sides, facecolors=CONTACT, alpha=0.25, linewidths=0, zorder=20))
 
 
-def picture(verdict: Verdict, motion: Screw | None, path: Path, mesh: trimesh.Trimesh | None) -> None:
-    """Write a picture to ``path``, whole or not at all; the suffix (png, svg, pdf) is the format."""
+def draw(verdict: Verdict, path: Path, mesh: trimesh.Trimesh | None = None) -> None:
+    """A picture: object, contacts, friction cones, forces; and the object moved along its escape.
+
+    It is written whole or not at all; the suffix of ``path`` (png, svg, pdf) is the format.
+    """
+    if verdict.status is Status.INVALID:
+        raise UserError("an invalid grasp has no picture; jaxgrasp explain says what is wrong with it")
     try:
         import matplotlib
         from matplotlib.figure import Figure
@@ -100,11 +104,32 @@ def picture(verdict: Verdict, motion: Screw | None, path: Path, mesh: trimesh.Tr
         raise UserError("pictures need matplotlib: pip install 'jaxgrasp[viz]'") from error
     figure = Figure(figsize=(7, 6.4), dpi=150)
     axes: Any = figure.add_axes((0.0, 0.0, 1.0, 0.9), projection="3d", computed_zorder=False)
+    motion = None if verdict.twist is None else screw(verdict.twist, verdict.centre_of_mass, verdict.size)
+    shown = np.concatenate(_draw_scene(axes, verdict, motion, mesh))
+    _frame(axes, shown)
+    axes.view_init(*view_of(verdict, shown))
+    kind = "" if motion is None else f": it escapes by a {motion.kind}"
+    figure.suptitle(f"{status_words(verdict.status)}{kind}, margin {verdict.margin:.3f}", y=0.96)
+    beside = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        with matplotlib.rc_context({"svg.hashsalt": "jaxgrasp"}):
+            figure.savefig(beside, facecolor="white", metadata=_undated(path))
+        os.replace(beside, path)
+    except (OSError, ValueError) as error:
+        reason = (getattr(error, "strerror", None) or str(error)).splitlines()[0]
+        raise UserError(f"{path} cannot be written as a picture: {reason}") from error
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def _draw_scene(
+    axes, verdict: Verdict, motion: Screw | None, mesh: trimesh.Trimesh | None
+) -> list[np.ndarray]:
+    """All there is to see; returns points that the picture must show."""
     size, com = verdict.size, verdict.centre_of_mass
     shown = [verdict.position[verdict.active]]
     if mesh is not None:
         size = max(size, 0.4 * float(np.max(mesh.extents)))
-    if mesh is not None:
         mesh = _simpler(mesh)
         points = np.asarray(mesh.vertices)
         shown.append(points)
@@ -126,29 +151,18 @@ def picture(verdict: Verdict, motion: Screw | None, path: Path, mesh: trimesh.Tr
     axes.scatter(*com, color="black", marker="+", s=60, depthshade=False, zorder=25)
     if motion is not None:
         shown.append(_draw_motion(axes, motion, com, size))
-    everything = np.concatenate(shown)
-    low, high = everything.min(axis=0), everything.max(axis=0)
+    return shown
+
+
+def _frame(axes, points: np.ndarray) -> None:
+    """Equal scales on all axes, no room wasted around ``points``, and no axes drawn."""
+    low, high = points.min(axis=0), points.max(axis=0)
     margin = 0.02 * float((high - low).max())
     low, high = low - margin, high + margin
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     sides = (high - low) / np.linalg.norm(high - low)
     axes.set_box_aspect(high - low, zoom=0.95 / np.sqrt(sides.max()))
     axes.set_axis_off()
-    axes.view_init(*view_of(verdict, everything))
-    kind = "" if motion is None else f": it escapes by a {motion.kind}"
-    figure.suptitle(
-        f"{verdict.status.name.replace('_', ' ').lower()}{kind}, margin {verdict.margin:.3f}", y=0.96
-    )
-    beside = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
-    try:
-        with matplotlib.rc_context({"svg.hashsalt": "jaxgrasp"}):
-            figure.savefig(beside, facecolor="white", metadata=_undated(path))
-        os.replace(beside, path)
-    except (OSError, ValueError) as error:
-        reason = (getattr(error, "strerror", None) or str(error)).splitlines()[0]
-        raise UserError(f"{path} cannot be written as a picture: {reason}") from error
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 def _undated(path: Path) -> dict[str, None] | None:

@@ -1,9 +1,7 @@
-"""A load on the grasps of a file: what ``jaxgrasp forces`` was asked for, checked before any work."""
+"""Forces against one load for the grasps of a file: what was asked for, checked before any work."""
 
 from __future__ import annotations
 
-import hashlib
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,17 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from ..contacts import MODELS, Component, ContactModel
+from ..contacts import MODELS, component_names
 from ..core import Status, UserError
 from ..forces import CRITERIA, Criterion, make_criterion, positive_option
 from ..formats import Contacts, GraspFile, SavedGrasps
-from .request import provenance
+from .outputs import derived_output, not_the_source, writable
+from .provenance import digest, provenance
+from .threads import thread_count
 
-__all__ = ["Load", "LoadRequest", "LoadRun", "prepare_load", "writable"]
+__all__ = ["ForcesPlan", "ForcesRequest", "Load", "plan_forces"]
 
 
 @dataclass(frozen=True)
-class LoadRequest:
+class ForcesRequest:
     """What the user asked for; None means not said.
 
     source  a Parquet file of screened grasps, or a file that ``save_grasp`` wrote
@@ -45,7 +45,7 @@ class LoadRequest:
     max_normal: float | None = None
     tolerance: float = 1e-8
     chunk: int = 65536
-    threads: int = 1
+    threads: int | None = None
 
 
 @dataclass(frozen=True)
@@ -70,43 +70,49 @@ class Load:
 
 
 @dataclass(frozen=True)
-class LoadRun:
-    """A checked request. ``metadata`` is what identifies the run and goes into the file; ``row`` None: many grasps."""
+class Selection:
+    """Which grasps of the source: ``row`` alone, or the ``count`` rows with this verdict; None: all of them."""
 
-    source: GraspFile | SavedGrasps
-    rows: int
     row: int | None
     status: Status | None
-    dimension: int
-    kind: str
-    centre_of_mass: np.ndarray
+    count: int
+
+
+@dataclass(frozen=True)
+class ForcesPlan:
+    """A checked request. ``metadata`` is what identifies the run and goes into the file.
+
+    output  None where one grasp is asked for and no file
+    """
+
+    request: ForcesRequest
+    source: GraspFile | SavedGrasps
+    selection: Selection
     load: Load
     criterion: Criterion
-    max_normal: float | None
-    tolerance: float
     output: Path | None
-    chunk: int
-    threads: int
     metadata: dict[str, Any]
+
+    @property
+    def threads(self) -> int:
+        """Chunks worked on at a time."""
+        return thread_count(self.request.threads)
+
+    @property
+    def chunk(self) -> int:
+        """Grasps solved together."""
+        return min(self.request.chunk, self.selection.count)
 
     def chunks(self) -> Iterator[tuple[np.ndarray, Contacts]]:
         """Row numbers and contacts, at most ``chunk`` at a time."""
-        if self.row is not None:
-            yield np.asarray([self.row]), self.source.row(self.row)
+        row = self.selection.row
+        if row is not None:
+            yield np.asarray([row]), self.source.row(row)
         else:
-            yield from self.source.selected(self.chunk, self.status)
-
-    @property
-    def fingers(self) -> int:
-        return self.source.fingers
-
-    @property
-    def model(self) -> ContactModel:
-        """The contact model, with no coefficients of its own yet."""
-        return MODELS[self.kind]()
+            yield from self.source.selected(self.chunk, self.selection.status)
 
 
-def _load(request: LoadRequest, dimension: int) -> Load:
+def _load(request: ForcesRequest, dimension: int) -> Load:
     m = 3 if dimension == 2 else 6
     axes = "x,y,z"[: 2 * dimension - 1]
     if (request.mass is None) == (request.wrench is None):
@@ -139,7 +145,8 @@ def _load(request: LoadRequest, dimension: int) -> Load:
 def _status(name: str | None) -> Status | None:
     if name is None:
         return None
-    names = {status.name.replace("_", "-").lower(): status for status in Status}
+    known = (Status(value) for value in range(Status.RESISTANT, Status.STALLED + 1))
+    names = {status.name.replace("_", "-").lower(): status for status in known}
     if name not in names:
         raise UserError(f"unknown status {name!r}; take one of {', '.join(names)}")
     return names[name]
@@ -165,94 +172,67 @@ def _source(name: str) -> GraspFile | SavedGrasps:
     return GraspFile(path)
 
 
-def writable(output: Path, option: str = "-o") -> None:
-    """Whether a file can be put there: UserError naming the ``option`` that says another place."""
-    if output.is_dir():
-        raise UserError(f"{output} is a directory; name a file with {option}")
-    beside = output.with_name(f".{output.name}.{os.getpid()}.try")
-    try:
-        beside.touch()
-        beside.unlink()
-    except OSError as error:
-        raise UserError(
-            f"{output} cannot be written: {error.strerror or error}; name another file with {option}"
-        ) from error
-
-
-def prepare_load(request: LoadRequest) -> LoadRun:
+def plan_forces(request: ForcesRequest) -> ForcesPlan:
     """Check the request and open its source. UserError: one line saying what to do."""
     criterion = make_criterion(request.criterion, request.weight, request.length)
     status = _status(request.status)
     positive_option("tolerance", request.tolerance)
     positive_option("max-normal", request.max_normal)
     for name, value in (("chunk", request.chunk), ("threads", request.threads)):
-        if value < 1:
+        if value is not None and value < 1:
             raise UserError(f"--{name} must be at least 1, got {value}")
     if request.row is not None and status is not None:
         raise UserError("--row names one grasp; leave --status out")
     source = _source(request.source)
-    if isinstance(source, SavedGrasps):
-        about: dict[str, Any] = {}
-        kind = next(name for name, model in MODELS.items() if isinstance(source.model, model))
-        dimension, com = source.dimension, np.zeros(source.dimension)
-    else:
-        about = {name: source.metadata.get(name) for name in ("object", "unit")}
-        kind, dimension = source.metadata["model"].get("kind"), 3
-        if kind not in MODELS:
-            raise UserError(f"{request.source} has contacts of an unknown model, {kind!r}; update jaxgrasp")
-        com = np.asarray(source.metadata["centre_of_mass"], np.float64)
-    spins = Component.SPIN in MODELS[kind]().components(dimension)
-    if request.length is not None and not spins:
-        raise UserError(f"--length weighs a soft finger's torque; {kind} contacts have none: leave it out")
-    load = _load(request, dimension)
+    if source.kind not in MODELS:
+        raise UserError(
+            f"{request.source} has contacts of an unknown model, {source.kind!r}; update jaxgrasp"
+        )
+    if request.length is not None and "tau_n" not in component_names(source.kind, source.dimension):
+        raise UserError(
+            f"--length weighs a soft finger's torque; {source.kind} contacts have none: leave it out"
+        )
+    load = _load(request, source.dimension)
+    selection = _select(request, source, status)
+    output = _output(request, selection)
+    metadata = _metadata(request, source, load, selection.row)
+    return ForcesPlan(request, source, selection, load, criterion, output, metadata)
+
+
+def _select(request: ForcesRequest, source: GraspFile | SavedGrasps, status: Status | None) -> Selection:
     row = 0 if request.row is None and source.rows == 1 and status is None else request.row
     if row is not None:
         source.row(row)  # says so if there is none
-    rows = 1 if row is not None else source.count(status)
-    if not rows:
+    count = 1 if row is not None else source.count(status)
+    if not count:
         raise UserError(f"no grasp in {request.source} is {request.status}; leave --status out")
+    return Selection(row, status, count)
+
+
+def _output(request: ForcesRequest, selection: Selection) -> Path | None:
     output = request.output
-    if output is None and row is None:
-        output = Path(Path(request.source).name.split(".")[0] + ".forces.parquet")
+    if output is None and selection.row is None:
+        output = derived_output(request.source, "forces.parquet")
     if output is not None:
-        if output.resolve() == Path(request.source).resolve():
-            raise UserError(f"{output} is the source; name another file with -o")
+        not_the_source(output, request.source)
         writable(output)
-    metadata = about | _metadata(request, source, kind, dimension, com, load, row)
-    return LoadRun(
-        source, rows, row, status, dimension, kind, com, load, criterion, request.max_normal, request.tolerance,
-        output, min(request.chunk, rows), request.threads, metadata,
-    )  # fmt: skip
+    return output
 
 
 def _metadata(
-    request: LoadRequest, source, kind: str, dimension: int, com, load: Load, row
+    request: ForcesRequest, source: GraspFile | SavedGrasps, load: Load, row: int | None
 ) -> dict[str, Any]:
-    words = ["jaxgrasp", "forces", request.source]
-    options: list[tuple[str, Any]] = [
-        ("--row", request.row), ("--status", request.status), ("--mass", request.mass),
-        ("--gravity", request.gravity), ("--g", request.g), ("--wrench", request.wrench),
-        ("--criterion", request.criterion), ("--weight", request.weight), ("--length", request.length),
-        ("--max-normal", request.max_normal), ("--tolerance", request.tolerance), ("--chunk", request.chunk),
-    ]  # fmt: skip
-    for flag, value in options:
-        if value is not None:
-            told = ",".join(map(repr, map(float, value))) if isinstance(value, tuple) else str(value)
-            words += [flag, told]
-    with Path(request.source).open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    names = ("row", "status", "mass", "gravity", "g", "wrench", "criterion", "weight", "length")
+    names += ("max_normal", "tolerance", "chunk")
     weight = (1.0 if request.weight is None else request.weight) if request.criterion == "robust" else None
-    model = {"kind": kind}
-    if isinstance(source, GraspFile):
-        model = source.metadata["model"]
     return {
-        "contacts": {"name": request.source, "sha256": digest},
+        **source.about,
+        "contacts": {"name": request.source, "sha256": digest(request.source)},
         "row": row,
         "status": request.status,
-        "centre_of_mass": com.tolist(),
-        "model": model,
+        "centre_of_mass": source.centre_of_mass.tolist(),
         "fingers": source.fingers,
-        "dimension": dimension,
+        "dimension": source.dimension,
         "dtype": "float64",
         "load": load.metadata,
         "criterion": {
@@ -263,5 +243,5 @@ def _metadata(
         },
         "max_normal": request.max_normal,
         "tolerance": request.tolerance,
-        **provenance(words),
+        **provenance("forces", request.source, {name: getattr(request, name) for name in names}),
     }
