@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import trimesh
     from matplotlib.figure import Figure
 
-    from .verdict_words import Verdict
+    from .answers import Verdict
 
 __all__ = [
     "bracket_of_the_margin",
@@ -63,7 +63,7 @@ def verdict_of(grasp: Grasp, answer: WrenchResistance, centre_of_mass: Any, forc
     grasp, answer   of one lane, about the centre of mass     centre_of_mass  (3,) m, mesh frame
     force           (k, n) N, drawn instead of the answer's internal force
     """
-    from .verdict_words import Verdict
+    from .answers import Verdict
 
     status = Status(int(answer.status))
     kind = {"Frictionless": "frictionless", "HardFinger": "hard", "SoftFinger": "soft"}[
@@ -79,7 +79,6 @@ def verdict_of(grasp: Grasp, answer: WrenchResistance, centre_of_mass: Any, forc
         "active": np.asarray(grasp.active),
         "status": int(status),
         "margin": float(answer.lower),
-        "gap": float(answer.upper - answer.lower),
         "upper": float(answer.upper),
         "rank": int(answer.rank),
         "internal_force": np.asarray(shown).ravel(),
@@ -90,7 +89,7 @@ def verdict_of(grasp: Grasp, answer: WrenchResistance, centre_of_mass: Any, forc
 
 def grasp_picture(verdict: Verdict, mesh: trimesh.Trimesh | None = None) -> bytes:
     """The PNG of ``draw``: object, contacts, friction cones, forces, or the object moved along its escape."""
-    from . import draw
+    from .drawing import draw
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "grasp.png"
