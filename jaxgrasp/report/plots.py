@@ -42,16 +42,17 @@ __all__ = [
 ]
 
 BLUE, RED, GREY, YELLOW = "#00798c", "#d1495b", "0.45", "#edae49"
-STYLE: Any = {"figure.dpi": 110, "axes.grid": True, "grid.alpha": 0.3, "font.size": 9}
 
 
 def panels_in_a_row(count: int, size: tuple[float, float], **options: Any) -> tuple[Figure, Any]:
     """A figure with ``count`` panels in a row, in the notebooks' style."""
     import matplotlib.pyplot as plt
 
-    plt.get_backend()  # chosen before the context, which would undo what the choice sets
-    with plt.rc_context(STYLE):
-        return plt.subplots(1, count, figsize=size, layout="constrained", **options)
+    # By hand and not in an ``rc_context``, which would also undo what a notebook's backend sets.
+    figure, axes = plt.subplots(1, count, figsize=size, dpi=110, layout="constrained", **options)
+    for one in np.atleast_1d(axes):
+        one.grid(True, alpha=0.3)
+    return figure, axes
 
 
 # Verdicts ------------------------------------------------------------------------------------------------
