@@ -9,7 +9,9 @@ jax.config.update("jax_enable_x64", True)  # 64-bit; without it JAX computes in 
 
 mug = jg.surfaces.of("mug", resolution=64)
 # Each start is the best of 2 048 random grasps. Contacts keep 1 cm apart.
-placed = jg.place_contacts(mug, fingers=3, starts=16, steps=40, requirements=[jg.placement.Apart(0.01)])
+placed = jg.place_contacts(
+    mug, fingers=3, requirements=[jg.placement.Apart(0.01)], search=jg.placement.Search(16, steps=40)
+)
 print(f"starts that hold: {np.sum(placed.before > 0)} of 16, ends that hold: {placed.resistant.sum()} of 16")
 print(f"best margin: {placed.before.max():.1f} at the starts, {placed.value[0]:.1f} at the ends")
 print("the median margin is larger at the ends:", np.median(placed.after) > np.median(placed.before))

@@ -29,7 +29,7 @@ import numpy as np
 
 import jaxgrasp as jg
 from jaxgrasp import surfaces
-from jaxgrasp.placement import Apart, place_contacts
+from jaxgrasp.placement import Apart, Search, place_contacts
 from jaxgrasp.report import plots
 
 jax.config.update("jax_enable_x64", True)  # without it JAX computes in float32
@@ -94,7 +94,9 @@ figure = plots.way_on_an_ellipsoid((0.03, 0.04, 0.06), ways[:, gain])
 # distinct grasps, each solved again and proved by the independent checker.
 
 # %%
-placed = place_contacts(surface, fingers=3, model=model, starts=64, steps=100, requirements=[Apart(0.02)])
+placed = place_contacts(
+    surface, fingers=3, model=model, requirements=[Apart(0.02)], search=Search(64, steps=100)
+)
 print(
     f"resistant: {np.mean(placed.before > 0):.0%} of the starts, {np.mean(placed.resistant):.0%} of the ends"
 )

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from families import random_coefficients, random_contacts
+from grasps import random_coefficients, random_contacts
 
 import jaxgrasp as jg
 from jaxgrasp import Status

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from quick_check import quick
 
 from jaxgrasp import Status
 from jaxgrasp.cli.main import main
@@ -73,16 +74,6 @@ def test_grasps_of_the_mug_are_checked(capsys, tmp_path, monkeypatch):
 # Chunks and shards, with something quick in place of the controllers ---------------------------------------
 
 
-def quick(run, contacts):
-    """Columns that depend on the grasp alone."""
-    x = contacts.position.sum((1, 2))
-    good = np.where(x > 0.3, 1, 4).astype(np.int32)
-    one = dict.fromkeys(("effort", "settling_time", "peak_force", "cone_use"), x)
-    twist, rank = np.repeat(x[:, None], 6, axis=1), np.full(len(x), 12.0)
-    columns = {"verdict": good, "status": good, "rank": rank, "weakest": twist, "recovered": good == 1}
-    return {"grasp_id": contacts.grasp_id, **columns, **one}
-
-
 QUICK = ["check", "mug", "--mass", "0.3", "--most", "10", "--chunk", "4"]
 
 
@@ -114,8 +105,7 @@ def test_a_stopped_check_goes_on_where_it_was(capsys, tmp_path, monkeypatch):
 
 KILLED = """
 import importlib, sys, time
-sys.path.insert(0, {tests!r})
-from test_cli_check import quick
+from quick_check import quick
 checking = importlib.import_module("jaxgrasp.jobs.check")
 from jaxgrasp.cli.main import main
 def slow(run, contacts):
@@ -128,11 +118,10 @@ sys.exit(main(sys.argv[1:]))
 
 def test_a_killed_check_goes_on_where_it_was(tmp_path, monkeypatch):
     """Killed with SIGKILL once a shard is there."""
-    code = KILLED.format(tests=os.path.dirname(__file__))
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "JAX_PLATFORMS": "cpu"}
     environment["JAX_ENABLE_X64"] = "1"
     process = subprocess.Popen(
-        [sys.executable, "-c", code, *QUICK], cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL
+        [sys.executable, "-c", KILLED, *QUICK], cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL
     )
     parts, deadline = tmp_path / "mug.check.parquet.parts", time.monotonic() + 120
     while not list(parts.glob("*.arrow")) and process.poll() is None and time.monotonic() < deadline:

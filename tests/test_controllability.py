@@ -6,15 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from families import KINDS, random_active, random_coefficients, random_contacts, random_rotation
-from motion_families import random_bodies
+from grasps import KINDS, random_active, random_coefficients, random_contacts, random_rotation
+from motion import random_bodies
 
 import jaxgrasp as jg
 from jaxgrasp.core.tolerances import rank_tolerance
 from jaxgrasp.motion.linearization import scaled_system
 
 V = jg.Status
-RNG = np.random.default_rng(41)
 BODY = jg.RigidBody(0.2, 1e-4 * np.diag([1.0, 1.2, 1.5])) if jax.config.jax_enable_x64 else None
 X, Y, Z = np.eye(3)
 TETRAHEDRON = 0.03 * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1.0]])
@@ -200,10 +199,11 @@ def test_given_forces_are_judged_and_change_no_rank(answers):
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_A_and_B_are_the_derivatives_of_the_motion(dimension):
     """Against automatic derivatives of (11.21) with contact forces that turn with the body; any gravity."""
+    rng = np.random.default_rng(41)
     k, m = 4, 6 if dimension == 3 else 3
-    position, normal, _ = random_contacts(RNG, 1, k, dimension)
-    body = jax.tree.map(lambda x: x[0], random_bodies(RNG, 1, dimension))
-    gravity = RNG.normal(size=dimension)
+    position, normal, _ = random_contacts(rng, 1, k, dimension)
+    body = jax.tree.map(lambda x: x[0], random_bodies(rng, 1, dimension))
+    gravity = rng.normal(size=dimension)
     model = jg.SoftFinger(0.5, 0.2) if dimension == 3 else jg.HardFinger(0.5)
     grasp = jg.Grasp(position[0], normal[0], model)
     load = np.concatenate([np.asarray(body.mass) * gravity, np.zeros(m - dimension)])
@@ -214,7 +214,7 @@ def test_A_and_B_are_the_derivatives_of_the_motion(dimension):
     def motion(x, f):
         state = jg.BodyState.at_rest(dimension).displaced(x[:m], x[m:])
         wrench = jg.motion.world_grasp_map(grasp, state.orientation) @ f
-        return jnp.concatenate([state.velocity, jg.motion.acceleration(body, state, wrench, gravity)])
+        return jnp.concatenate([state.velocity, jg.motion.acceleration(body, state, wrench, gravity=gravity)])
 
     A, B = jax.jacfwd(motion, argnums=(0, 1))(jnp.zeros(2 * m), jnp.asarray(force))
     from jaxgrasp.motion.linearization import _blocks
@@ -267,14 +267,15 @@ def test_reduced_and_full_rank_agree_on_random_grasps(dimension):
     A rank is clear where no singular value, as a share of the largest, lies between 8 eps and 1e-11; it is 64 eps that
     decides.
     """
+    rng = np.random.default_rng(41)
     n, k, m = 10_000, 4, 6 if dimension == 3 else 3
-    position, normal, kind = random_contacts(RNG, n, k, dimension)
-    mu, gamma = random_coefficients(RNG, n, k)
-    active = random_active(RNG, n, k)
+    position, normal, kind = random_contacts(rng, n, k, dimension)
+    mu, gamma = random_coefficients(rng, n, k)
+    active = random_active(rng, n, k)
     model = jg.SoftFinger(mu, gamma) if dimension == 3 else jg.HardFinger(mu)
     grasp = jg.Grasp(position, normal, model, active)
-    gravity = np.where(RNG.random((n, 1)) < 0.05, 0.0, RNG.normal(size=(n, dimension)))
-    system = scaled_system(grasp, random_bodies(RNG, n, dimension), gravity)
+    gravity = np.where(rng.random((n, 1)) < 0.05, 0.0, rng.normal(size=(n, dimension)))
+    system = scaled_system(grasp, random_bodies(rng, n, dimension), gravity)
     A_c, B_c = np.asarray(system.A_c), np.asarray(system.B_c)
     cut = rank_tolerance(A_c.dtype)
 
@@ -345,8 +346,9 @@ def test_ranks_are_those_of_exact_arithmetic():
 
 @pytest.mark.slow
 def test_verdicts_do_not_depend_on_axes_or_units(answers):
+    rng = np.random.default_rng(41)
     grasp, found = answers
-    turn, size = random_rotation(RNG), 1000.0
+    turn, size = random_rotation(rng), 1000.0
     inertia = size**2 * turn @ np.asarray(BODY.inertia) @ turn.T
     body = jg.RigidBody(0.2, (inertia + inertia.T) / 2)
     model = jg.SoftFinger(grasp.model.friction_coefficient, size * grasp.model.torsion_coefficient)
@@ -375,7 +377,9 @@ def test_the_gramian_is_its_integral():
         w / 2 * 1.5 * (E := expm(A * 1.5 * (x + 1) / 2)) @ B @ B.T @ E.T
         for x, w in zip(nodes, weights, strict=True)
     )
-    np.testing.assert_allclose(jg.motion.gramian(jnp.asarray(A), jnp.asarray(B), 1.5), wanted, atol=1e-12)
+    np.testing.assert_allclose(
+        jg.motion.gramian(jnp.asarray(A), jnp.asarray(B), horizon=1.5), wanted, atol=1e-12
+    )
 
 
 def test_the_weakest_direction_costs_its_effort(answers):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from clarabel_oracle import clarabel_margin
-from test_epsilon import ball
+from grasps import ball
 
 import jaxgrasp as jg
 from jaxgrasp import Status

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from families import random_rotation
-from motion_families import random_bodies, random_states
+from grasps import random_rotation
+from motion import random_bodies, random_states
 from scipy.spatial.transform import Rotation
 
 import jaxgrasp as jg
@@ -18,7 +18,6 @@ from jaxgrasp.core.rotations import (
     turned,
 )
 
-RNG = np.random.default_rng(40)
 pytestmark = pytest.mark.f32
 
 
@@ -30,7 +29,8 @@ ANGLES = np.array([0.0, 1e-9, 1e-4, 0.1, 0.2235, 0.2237, 1.0, 2.0, 3.0, 3.14159]
 
 
 def rotation_vectors(dtype):
-    axes = RNG.normal(size=(len(ANGLES), 3))
+    rng = np.random.default_rng(41)
+    axes = rng.normal(size=(len(ANGLES), 3))
     return (ANGLES[:, None] * axes / np.linalg.norm(axes, axis=1, keepdims=True)).astype(dtype)
 
 
@@ -38,12 +38,13 @@ def rotation_vectors(dtype):
 
 
 def test_the_exponential_and_the_matrix_are_scipys(dtype):
+    rng = np.random.default_rng(40)
     v = rotation_vectors(dtype)
     start = jg.BodyState.at_rest(3, (len(v),), dtype).orientation
     q = turned(start, jnp.asarray(v))
     wanted = Rotation.from_rotvec(v.astype(float)).as_matrix()
     np.testing.assert_allclose(orientation_matrix(q), wanted, atol=close(dtype))
-    x = RNG.normal(size=v.shape).astype(dtype)
+    x = rng.normal(size=v.shape).astype(dtype)
     np.testing.assert_allclose(
         rotate(q, jnp.asarray(x)), np.einsum("nij,nj->ni", wanted, x), atol=close(dtype)
     )
@@ -60,9 +61,10 @@ def test_the_logarithm_undoes_the_exponential(dtype):
 
 
 def test_the_jacobian_is_the_derivative_of_the_exponential(dtype):
+    rng = np.random.default_rng(40)
     if dtype != "float64":
         pytest.skip("finite differences need float64")
-    v, rate, h = rotation_vectors(dtype)[:-1], RNG.normal(size=(len(ANGLES) - 1, 3)), 1e-5
+    v, rate, h = rotation_vectors(dtype)[:-1], rng.normal(size=(len(ANGLES) - 1, 3)), 1e-5
     after = Rotation.from_rotvec(v + h * rate) * Rotation.from_rotvec(v - h * rate).inv()
     omega = jacobian_product(jnp.asarray(v), jnp.asarray(rate))
     np.testing.assert_allclose(omega, after.as_rotvec() / (2 * h), atol=1e-8)
@@ -96,12 +98,13 @@ def test_planar_rotations_are_angles(dtype):
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_the_equation_of_motion_holds(dimension, dtype):
     """M q'' + B + G = G^W f with every term from its own function, forces in random poses."""
+    rng = np.random.default_rng(40)
     n, k = 20, 3
-    body = random_bodies(RNG, n, dimension, dtype)
-    state = random_states(RNG, n, dimension, dtype)
-    position = RNG.normal(size=(n, k, dimension)).astype(dtype)
+    body = random_bodies(rng, n, dimension, dtype)
+    state = random_states(rng, n, dimension, dtype)
+    position = rng.normal(size=(n, k, dimension)).astype(dtype)
     grasp = jg.Grasp(position, -position, jg.HardFinger(jnp.asarray(0.5, dtype)))
-    force = jnp.asarray(RNG.normal(size=(n, k * dimension)).astype(dtype))
+    force = jnp.asarray(rng.normal(size=(n, k * dimension)).astype(dtype))
     wrench = jnp.einsum("nij,nj->ni", jg.motion.world_grasp_map(grasp, state.orientation), force)
     qdd = jg.motion.acceleration(body, state, wrench)
     left = jnp.einsum("nij,nj->ni", jg.motion.mass_matrix(body, state.orientation), qdd)
@@ -111,7 +114,8 @@ def test_the_equation_of_motion_holds(dimension, dtype):
 
 def test_the_terms_are_newtons_and_eulers(dtype):
     """In numpy, from R, I and omega alone."""
-    body, state = random_bodies(RNG, 5, 3, dtype), random_states(RNG, 5, 3, dtype)
+    rng = np.random.default_rng(40)
+    body, state = random_bodies(rng, 5, 3, dtype), random_states(rng, 5, 3, dtype)
     R = Rotation.from_quat(np.asarray(state.orientation, float)[:, [1, 2, 3, 0]]).as_matrix()
     inertia = R @ np.asarray(body.inertia, float) @ R.transpose(0, 2, 1)
     omega = np.asarray(state.velocity[:, 3:], float)
@@ -124,7 +128,7 @@ def test_the_terms_are_newtons_and_eulers(dtype):
         M[:, :3, :3], np.asarray(body.mass)[:, None, None] * np.eye(3), atol=close(dtype)
     )
     np.testing.assert_allclose(M[:, :3, 3:], 0)
-    weight = jg.motion.gravity_term(body, (0.0, 0.0, -10.0))
+    weight = jg.motion.gravity_term(body, gravity=(0.0, 0.0, -10.0))
     np.testing.assert_allclose(weight[:, 2], 10 * np.asarray(body.mass), rtol=1e-6)
 
 
@@ -138,16 +142,17 @@ def test_contact_forces_turn_with_the_body(dtype):
 
 
 def test_a_free_body_keeps_momentum_and_nearly_its_energy(dtype):
+    rng = np.random.default_rng(40)
     if dtype != "float64":
         pytest.skip("drift over a thousand steps is measured in float64")
-    body, state = random_bodies(RNG, 4, 3, dtype), random_states(RNG, 4, 3, dtype)
+    body, state = random_bodies(rng, 4, 3, dtype), random_states(rng, 4, 3, dtype)
     none, h = jnp.zeros((4, 6)), 1e-4
 
     def momentum(s):
         return jnp.einsum("nij,nj->ni", jg.motion.mass_matrix(body, s.orientation), s.velocity)
 
     def step(_, s):
-        return jg.motion.advance(body, s, none, h, gravity=(0.0, 0.0, 0.0))
+        return jg.motion.advance(body, s, none, timestep=h, gravity=(0.0, 0.0, 0.0))
 
     after = jax.jit(lambda s: jax.lax.fori_loop(0, 1000, step, s))(state)
     scale = np.abs(momentum(state)).max()
@@ -161,7 +166,7 @@ def test_falling_is_exact(dtype):
     body = jg.RigidBody(jnp.asarray(0.2, dtype), 1e-4 * jnp.eye(3, dtype=dtype))
     state = jg.BodyState.at_rest(3, (), dtype)
     for _ in range(10):
-        state = jg.motion.advance(body, state, jnp.zeros(6, dtype), 0.01)
+        state = jg.motion.advance(body, state, jnp.zeros(6, dtype), timestep=0.01)
     np.testing.assert_allclose(state.velocity, [0, 0, -0.981, 0, 0, 0], atol=1e-6)
     np.testing.assert_allclose(state.position, [0, 0, -9.81 * 0.01**2 * 55], atol=1e-6)
 
@@ -180,7 +185,8 @@ def test_a_body_from_a_mesh(dtype):
 
 
 def test_derivatives_reach_mass_and_inertia(dtype):
-    state = random_states(RNG, 1, 3, dtype)
+    rng = np.random.default_rng(40)
+    state = random_states(rng, 1, 3, dtype)
     state = jax.tree.map(lambda x: x[0], state)
     inertia = jnp.diag(jnp.asarray([1.0, 1.2, 1.5], dtype))
 
@@ -257,25 +263,26 @@ def test_wrong_meshes_raise():
 def test_gravity_must_be_a_vector(dtype):
     body = jg.RigidBody(1.0, np.eye(3))
     with pytest.raises(ValueError, match="gravity must be a vector of 3"):
-        jg.motion.gravity_term(body, (0.0, -9.81))
+        jg.motion.gravity_term(body, gravity=(0.0, -9.81))
 
 
 def test_rotating_everything_rotates_the_answer(dtype):
     """The equations do not know where the axes point."""
-    turn = random_rotation(RNG)
+    rng = np.random.default_rng(40)
+    turn = random_rotation(rng)
     q = Rotation.from_matrix(turn).as_quat()[[3, 0, 1, 2]].astype(dtype)
-    body, state = random_bodies(RNG, 3, 3, dtype), random_states(RNG, 3, 3, dtype)
+    body, state = random_bodies(rng, 3, 3, dtype), random_states(rng, 3, 3, dtype)
     from jaxgrasp.core.rotations import quaternion_product
 
-    wrench, g = RNG.normal(size=(3, 6)).astype(dtype), RNG.normal(size=3).astype(dtype)
+    wrench, g = rng.normal(size=(3, 6)).astype(dtype), rng.normal(size=3).astype(dtype)
     both = np.kron(np.eye(2), turn).astype(dtype)
     moved = jg.BodyState(
         state.position @ turn.T.astype(dtype),
         quaternion_product(jnp.broadcast_to(jnp.asarray(q), (3, 4)), state.orientation),
         state.velocity @ both.T,
     )
-    first = jg.motion.acceleration(body, state, jnp.asarray(wrench), g)
+    first = jg.motion.acceleration(body, state, jnp.asarray(wrench), gravity=g)
     second = jg.motion.acceleration(
-        body, moved, jnp.asarray(wrench @ both.T), jnp.asarray(turn.astype(dtype) @ g)
+        body, moved, jnp.asarray(wrench @ both.T), gravity=jnp.asarray(turn.astype(dtype) @ g)
     )
     np.testing.assert_allclose(second, first @ both.T, atol=50 * close(dtype))

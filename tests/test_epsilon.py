@@ -5,19 +5,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from grasps import ball
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 
 import jaxgrasp as jg
 from jaxgrasp import Status
 from jaxgrasp.quality.unit_wrench_space import effort_map, scaled, torque_lengths
-
-
-def ball(rng, count, k, tilt=0.3):
-    """Hard fingers on a unit sphere with tilted normals: position, normal, friction."""
-    position = rng.normal(size=(count, k, 3))
-    position /= np.linalg.norm(position, axis=-1, keepdims=True)
-    return position, -position + tilt * rng.normal(size=position.shape), rng.uniform(0.3, 0.8, (count, k))
 
 
 @pytest.fixture(scope="module")

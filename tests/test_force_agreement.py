@@ -49,7 +49,7 @@ def oracle(grasp, components, wrench, criterion, parameter, cap, limit):
 
 
 STALLED_SHARE = 0.005
-FAST = {"gentlest": [("soft", True, 400)]}  # one compilation; the slow runs do the rest
+FAST = {"gentlest": [("soft", True, 120)]}  # one compilation; the slow runs do the rest
 MARKED = [pytest.param(n, FAST[n], id=f"{n}, few") for n in FAST]
 MARKED += [pytest.param(n, RUNS[n], id=n, marks=pytest.mark.slow) for n in RUNS]
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_epsilon import ball
+from grasps import ball
 
 import jaxgrasp as jg
 from jaxgrasp import Status

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_epsilon import ball
+from grasps import ball
 
 import jaxgrasp as jg
 

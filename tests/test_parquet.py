@@ -310,9 +310,9 @@ def test_a_file_of_forces_of_version_1_reads_the_same(tmp_path):
 def test_the_columns_come_from_the_solvers_answer():
     answer = SimpleNamespace(
         status=np.array([1, 2, 5]),
-        margin=np.array([0.5, -np.inf, np.nan]),
-        gap=np.array([0.25, 0.0, np.nan]),
-        rank=np.array([6.0, 5.0, np.nan]),
+        lower=np.array([0.5, -np.inf, np.nan]),
+        upper=np.array([0.75, -np.inf, np.nan]),
+        rank=np.array([6, 5, -1]),
         internal_force=np.ones((3, 6)),
         escape_twist=np.zeros((3, 6)),
         iterations=np.array([4, 5, 0]),

@@ -5,7 +5,7 @@ from decimal import Decimal, localcontext
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from families import random_active, random_coefficients, random_contacts, random_rotation
+from grasps import random_active, random_coefficients, random_contacts, random_rotation
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_derivatives import as_arrays, direction, grasp_of, hard_problem, only, planar_problem, soft_problem
-from test_epsilon import ball
+from grasps import ball
+from smooth_problems import as_arrays, direction, grasp_of, hard_problem, only, planar_problem, soft_problem
 
 import jaxgrasp as jg
 from jaxgrasp import Status

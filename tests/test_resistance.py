@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from families import random_active, random_coefficients, random_contacts
+from grasps import random_active, random_coefficients, random_contacts
+from shapes import HARD, PLANAR, SOFT
 
 import jaxgrasp as jg
 from jaxgrasp import Status
@@ -18,7 +19,7 @@ def unit(v):
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
-def padded(position, normal, k=6):
+def padded(position, normal, k=SOFT):
     """One grasp padded to k contacts with NaN, which must not matter."""
     position, normal = np.asarray(position, float), np.asarray(normal, float)
     fill = np.full((k - len(position), position.shape[1]), np.nan)
@@ -169,24 +170,31 @@ def test_escape_twist_is_opposed_by_no_force(known):
 def test_two_planar_fingers_obey_nguyen(angle):
     """Critical mu = tan of the largest angle between a normal and the joining line."""
     a = np.deg2rad(angle)
-    position = np.array([[-1.0, 0], [1, 0]])
-    normal = np.array([[np.cos(a), np.sin(a)], [-1, 0]])
+    position = np.array([[-1.0, 0], [1, 0], [0, 1]])  # the third is padding
+    normal = np.array([[np.cos(a), np.sin(a)], [-1, 0], [0, -1]])
+    active = np.array([True, True, False])
     factors = np.array([0.5, 0.99, 0.9999, 1.0001, 1.01, 2.0])
-    friction = np.tan(a) * factors[:, None] * np.ones((6, 2))
-    grasp = jg.Grasp(np.tile(position, (6, 1, 1)), np.tile(normal, (6, 1, 1)), jg.HardFinger(friction))
+    friction = np.tan(a) * factors[:, None] * np.ones((6, PLANAR))
+    grasp = jg.Grasp(
+        np.tile(position, (6, 1, 1)),
+        np.tile(normal, (6, 1, 1)),
+        jg.HardFinger(friction),
+        np.tile(active, (6, 1)),
+    )
     res = jg.wrench_resistance(grasp)
     assert list(res.status) == [Status.NOT_RESISTANT] * 3 + [Status.RESISTANT] * 3
     assert jg.check(grasp, res).all()
-    critical = jg.wrench_resistance(jg.Grasp(position, normal, jg.HardFinger(np.tan(a))))
+    critical = jg.wrench_resistance(jg.Grasp(position, normal, jg.HardFinger(np.tan(a)), active))
     assert abs(float(critical.margin)) < 1e-8
     assert critical.status in (Status.MARGINAL, Status.NOT_RESISTANT, Status.RESISTANT)
 
 
 def test_no_internal_force_with_a_normal_part_gives_minus_infinity():
     """Two parallel normals, one plane apart: nothing pushes back."""
-    position = np.array([[[-1.0, 0], [1, 0]]])
-    normal = np.array([[[0.0, 1], [0, 1]]])
-    grasp = jg.Grasp(position, normal, jg.HardFinger(np.zeros((1, 2))))
+    position = np.array([[[-1.0, 0], [1, 0], [0, 0]]])
+    normal = np.array([[[0.0, 1], [0, 1], [0, 1]]])
+    active = np.array([[True, True, False]])
+    grasp = jg.Grasp(position, normal, jg.HardFinger(np.zeros((1, PLANAR))), active)
     res = jg.wrench_resistance(grasp)
     assert res.margin[0] == -np.inf
     assert res.gap[0] == 0
@@ -211,7 +219,7 @@ BAD = {
 @pytest.fixture(scope="module")
 def batch(dtype):
     rng = np.random.default_rng(3)
-    n, k = 150, 6
+    n, k = 150, SOFT
     position, normal, _ = random_contacts(rng, n, k, 3)
     friction, torsion = random_coefficients(rng, n, k)
     return {
@@ -223,8 +231,28 @@ def batch(dtype):
     }
 
 
+@pytest.fixture(scope="module", params=["planar", pytest.param("soft", marks=pytest.mark.slow)])
+def batch_of_a_model(request, batch, dtype):
+    """Soft fingers in space, or hard ones in the plane: a smaller program where a test compiles several."""
+    if request.param == "soft":
+        return batch
+    rng = np.random.default_rng(3)
+    n, k = 150, PLANAR
+    position, normal, _ = random_contacts(rng, n, k, 2)
+    friction, _ = random_coefficients(rng, n, k)
+    return {
+        "position": position.astype(dtype),
+        "normal": normal.astype(dtype),
+        "friction": friction.astype(dtype),
+        "active": random_active(rng, n, k),
+    }
+
+
 def build(arrays):
-    model = jg.SoftFinger(arrays["friction"], arrays["torsion"])
+    if "torsion" in arrays:
+        model = jg.SoftFinger(arrays["friction"], arrays["torsion"])
+    else:
+        model = jg.HardFinger(arrays["friction"])
     return jg.Grasp(arrays["position"], arrays["normal"], model, arrays["active"])
 
 
@@ -264,26 +292,30 @@ def test_bits_do_not_depend_on_batch_neighbours_or_position(batch, verdict_only)
     assert_same_bits(jax.tree.map(lambda x: x[order], whole), shuffled)
 
 
-def test_bits_do_not_depend_on_the_tile(batch, monkeypatch):
+def test_bits_do_not_depend_on_the_tile(batch_of_a_model, monkeypatch):
     from jaxgrasp.resistance import solve as resistance
 
+    batch = batch_of_a_model
     whole = jg.wrench_resistance(build(batch))
     for width in (16, 32):
         monkeypatch.setattr(resistance, "tile_width", lambda _, w=width: w)
         assert_same_bits(whole, jg.wrench_resistance(build(batch)))
 
 
-def test_padding_does_not_change_a_bit(batch):
-    few = {name: value[:40] for name, value in batch.items()}
-    few["active"] = np.tile(np.arange(6) < 4, (40, 1))
-    short = {name: value[:, :4] for name, value in few.items()}
+def test_padding_does_not_change_a_bit(batch_of_a_model):
+    few = {name: value[:40] for name, value in batch_of_a_model.items()}
+    k = few["active"].shape[1]
+    kept = 2 * k // 3
+    few["active"] = np.tile(np.arange(k) < kept, (40, 1))
+    short = {name: value[:, :kept] for name, value in few.items()}
     long, cut = jg.wrench_resistance(build(few)), jg.wrench_resistance(build(short))
     np.testing.assert_array_equal(long.status, cut.status)
     np.testing.assert_allclose(long.margin, cut.margin, rtol=1e-9, atol=2e-8)
-    assert (np.asarray(long.internal_force).reshape(40, 6, 4)[:, 4:] == 0).all()
+    assert (np.asarray(long.internal_force).reshape(40, k, -1)[:, kept:] == 0).all()
 
 
-def test_batch_axes_jit_and_vmap_agree_bit_for_bit(batch):
+def test_batch_axes_jit_and_vmap_agree_bit_for_bit(batch_of_a_model):
+    batch = batch_of_a_model
     grasp = build(batch)
     flat = jg.wrench_resistance(grasp)
     folded = build({name: value.reshape(3, 50, *value.shape[1:]) for name, value in batch.items()})
@@ -333,10 +365,11 @@ def test_wrong_structure_raises_at_trace_time(batch):
         jg.Grasp(np.zeros((2, 2)), np.ones((2, 2)), jg.SoftFinger())
 
 
-def test_one_grasp_under_jit():
+@pytest.mark.parametrize(("k", "dimension"), [(PLANAR, 2), pytest.param(HARD, 3, marks=pytest.mark.slow)])
+def test_one_grasp_under_jit(k, dimension):
     """XLA once dropped the loop over tiles when the batch was a single grasp known at compile time."""
     rng = np.random.default_rng(4)
-    normal = rng.normal(size=(1, 4, 3))
+    normal = rng.normal(size=(1, k, dimension))
     grasp = jg.Grasp(-normal / np.linalg.norm(normal, axis=-1, keepdims=True), normal, jg.HardFinger(0.5))
     eager, jitted = jg.wrench_resistance(grasp), jax.jit(jg.wrench_resistance)(grasp)
     assert int(jitted.status[0]) == int(eager.status[0]) != 0

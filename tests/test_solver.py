@@ -371,7 +371,7 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np
 import jaxgrasp as jg
 from jaxgrasp.backend import xla as stages
-from families import random_coefficients, random_contacts
+from grasps import random_coefficients, random_contacts
 
 def double(x):
     return 2 * x
@@ -393,7 +393,7 @@ def test_kernels_off_gives_the_same_answers(tmp_path):
             **os.environ,
             "JAX_PLATFORMS": "cpu",
             "JAXGRASP_KERNELS": switch,
-            "PYTHONPATH": os.pathsep.join([str(here.parent), str(here)]),
+            "PYTHONPATH": os.pathsep.join([str(here.parent), str(here / "tables")]),
         }
         path = tmp_path / f"{switch}.npz"
         subprocess.run([sys.executable, "-c", KERNELS, str(path)], env=environment, check=True, timeout=300)

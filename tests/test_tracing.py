@@ -7,23 +7,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from families import random_coefficients, random_contacts
+from grasps import random_coefficients, random_contacts
+from shapes import PLANAR, SOFT
 
 import jaxgrasp as jg
 from jaxgrasp.core.status import Status
 
-K = 6
 
-
-@pytest.fixture(scope="module")
-def grasps(dtype):
+@pytest.fixture(scope="module", params=["planar", pytest.param("soft", marks=pytest.mark.slow)])
+def grasps(request, dtype):
+    """Hard fingers in the plane: of the three shapes the one that compiles fastest. Soft ones in space: slowly."""
     rng = np.random.default_rng(21)
-    position, normal, _ = random_contacts(rng, 40, K, 3)
-    friction, torsion = random_coefficients(rng, 40, K)
+    k, dimension = (PLANAR, 2) if request.param == "planar" else (SOFT, 3)
+    position, normal, _ = random_contacts(rng, 40, k, dimension)
+    friction, torsion = random_coefficients(rng, 40, k)
     friction += 0.05
-    model = jg.SoftFinger(friction.astype(dtype), torsion.astype(dtype))
-    active = np.ones((40, K), bool)
-    active[7, 3:] = False
+    if dimension == 2:
+        model = jg.HardFinger(friction.astype(dtype))
+    else:
+        model = jg.SoftFinger(friction.astype(dtype), torsion.astype(dtype))
+    active = np.ones((40, k), bool)
+    active[7, k // 2 + k % 2 :] = False
     return jg.Grasp(position.astype(dtype), normal.astype(dtype), model, active)
 
 
@@ -90,7 +94,9 @@ def test_a_batch_is_refused_with_advice(grasps):
 
 
 def test_a_lane_that_is_no_grasp_is_skipped(grasps):
-    invalid = jg.Grasp(np.full((K, 3), np.nan), np.ones((K, 3)), jg.SoftFinger(0.5, 0.1))
+    shape, dtype = grasps.position.shape[1:], grasps.position.dtype
+    model = jg.HardFinger if grasps.dimension == 2 else jg.SoftFinger
+    invalid = jg.Grasp(np.full(shape, np.nan, dtype), np.ones(shape, dtype), model(np.asarray(0.5, dtype)))
     traced = jg.trace(invalid)
     assert traced.stop == Status.SKIPPED
     assert len(traced.gap) == 1
@@ -107,7 +113,7 @@ def test_a_saved_lane_reproduces_its_verdict_bit_for_bit(tmp_path, grasps, resul
         jg.save_grasp(grasps[i], path)
         again = jg.load_grasp(path)
         assert again.position.dtype == grasps.position.dtype
-        assert type(again.model) is jg.SoftFinger
+        assert type(again.model) is type(grasps.model)
         assert bits(again) == bits(grasps[i])
         assert bits(jg.wrench_resistance(again)) == bits(jax.tree.map(lambda x, i=i: x[i], results))
 

@@ -2,13 +2,14 @@
 
 from .device import precision, remember_compilations, usable_backend
 from .tiles import batched, in_chunks, in_sweeps, map_selected, map_tiles, tile_width, to_lanes, to_rows
-from .xla import inlined, kernel, stage
+from .xla import inlined, is_traced, kernel, stage
 
 __all__ = [
     "batched",
     "in_chunks",
     "in_sweeps",
     "inlined",
+    "is_traced",
     "kernel",
     "map_selected",
     "map_tiles",

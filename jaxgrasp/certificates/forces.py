@@ -11,20 +11,17 @@ the twist y and the joint rates beta of the result:
     INVALID     the numbers are indeed no problem
     STALLED     claims nothing, so there is nothing to refute
 
-Lower bounds, for any y, with gain = y.w - sum_j |beta_j| tau_j and rho_i = |x_t,i| - x_0,i:
-
-    sum          gain / max rho,  or  gain - sum_i cap_i (rho_i - 1)+
-    gentlest     gain / sum rho+, or  gain - sum_i cap_i (rho_i - lambda_i)+ for the best lambda >= 0 of sum 1
-    quadratic    gain + sum_i min_{0 <= s <= cap_i} (s^2 - rho'_i s) - s_t D s_t / 2: the tails' cost replaced by its
-                 tangent at the given forces, which a convex cost never falls below
-    robust       gain - sum_i cap_i alpha_i + sum_i of the conjugates of the barrier's pieces
+The dual functions are in ``criteria``.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from .rebuilt import EPS, ROUNDING, Rebuilt, rebuild, scaled_force
+from .criteria import Asked, Multipliers, cost, lower_bound, robust_sensitivity
+from .rebuilt import EPS, ROUNDING, Rebuilt, rebuild, scaled_force, scaled_twist, scaled_wrench
 
 __all__ = ["check_forces"]
 
@@ -34,246 +31,164 @@ FINE = 256.0  # rounding, in units of eps of the grasp's dtype, that forces may 
 CLOSE = 1e-6  # relative gap that OPTIMAL may leave
 
 
-def _spread(array: np.ndarray, loads: int) -> np.ndarray:
-    return np.repeat(array, loads, axis=0) if loads != 1 else array
+class Told(NamedTuple):
+    """What a result claims of N lanes: forces (N, k, n), twists (N, m), rates (N, q), the rest (N,)."""
+
+    force: np.ndarray
+    cost: np.ndarray
+    bound: np.ndarray
+    load_twist: np.ndarray
+    escape_twist: np.ndarray
+    joint_rates: np.ndarray
 
 
-def _top_share(short: np.ndarray, cap: np.ndarray, total: float = 1.0) -> np.ndarray:
-    """The part of ``short`` (N, k) that lambda of sum 1 should cover: the dearest caps first."""
-    order = np.argsort(-cap, axis=-1, kind="stable")
-    sorted_short = np.take_along_axis(short, order, -1)
-    before = np.cumsum(sorted_short, -1) - sorted_short
-    covered = np.clip(total - before, 0.0, sorted_short)
-    out = np.zeros_like(short)
-    np.put_along_axis(out, order, covered, -1)
-    return out
+class Sizes(NamedTuple):
+    """What rounding is relative to (N,): of the forces, the load, A; and ``reach`` (N, q) of the torques."""
 
-
-def _paid(left: np.ndarray, cap: np.ndarray, room: float) -> np.ndarray:
-    """``sum cap left``, where what is rounding beside 1 costs nothing without a cap."""
-    free = ~np.isfinite(cap) & (left <= room)
-    return np.sum(np.where(free | (left <= 0), 0.0, left * cap), -1)
-
-
-def _log_det_terms(known: Rebuilt, dimension: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """log det P = a log f_n + b log(f_n^2 - psi^2) + c per contact, (11.4), (11.35)."""
-    mu, rough = known.friction, known.friction > 0
-    if known.components == ["f_n"]:
-        return np.ones_like(mu), np.zeros_like(mu), np.zeros_like(mu)
-    if "tau_n" in known.components:
-        return np.where(rough, 2.0, 1.0), rough * 1.0, np.zeros_like(mu)
-    constant = dimension * np.log(np.where(rough, mu, 1.0))
-    return np.where(rough, dimension - 2.0, 1.0), rough * 1.0, constant
-
-
-def _curvatures(known: Rebuilt, name: str, length) -> np.ndarray:
-    """D / 2 per component, normal first (N, k, n)."""
-    parts = [np.ones_like(known.friction)]
-    for component in known.components:
-        if component == "f_n":
-            continue
-        if name == "SumOfSquares":
-            parts.append(np.zeros_like(known.friction))
-        elif component == "tau_n":
-            parts.append(
-                np.ones_like(known.torsion) if length is None else (known.torsion / length[:, None]) ** 2
-            )
-        else:
-            parts.append(known.friction**2)
-    return np.stack(parts, -1)
+    force: np.ndarray
+    load: np.ndarray
+    A: np.ndarray
+    reach: np.ndarray
 
 
 def check_forces(grasp, result, tolerance: float | None = None) -> np.ndarray:
     """True for each lane whose answer the evidence proves; shape of ``result.status``."""
-    dtype = np.dtype(grasp.position.dtype)
-    dimension, k = grasp.position.shape[-1], grasp.position.shape[-2]
-    m = 3 if dimension == 2 else 6
     shape = np.shape(result.status)
-    grasps = int(np.prod(grasp.position.shape[:-2]))
-    lanes_total = int(np.prod(shape))
-    loads = lanes_total // max(grasps, 1)
-    known = rebuild(grasp)
-    arrays = {name: _spread(x, loads) for name, x in known._asdict().items() if isinstance(x, np.ndarray)}
-    known = known._replace(**arrays)
-    n, live = len(known.components), known.live
-    eps = float(np.finfo(dtype).eps)
-
-    def lanes(array, *own):
-        return np.asarray(array, np.float64).reshape(lanes_total, *own)
-
     status = np.asarray(result.status).reshape(-1)
-    force, wrench = lanes(result.force, k, n), lanes(result.wrench, m)
-    cost, bound = lanes(result.cost), lanes(result.bound)
-    name = type(result.criterion).__name__
-    weight = getattr(result.criterion, "weight", None)
-    length = getattr(result.criterion, "length", None)
-    weight = None if weight is None else lanes(np.broadcast_to(weight, shape))
-    length = None if length is None else lanes(np.broadcast_to(length, shape))
-    cap = np.full((lanes_total, k), np.inf) if result.max_normal is None else lanes(result.max_normal, k)
-
     with np.errstate(all="ignore"):
-        valid = known.valid & np.isfinite(wrench).all(-1) & ((cap > 0) | ~live).all(-1)
-        for parameter in (weight, length):
-            if parameter is not None:
-                valid &= np.isfinite(parameter) & (parameter > 0)
-        if result.torque_limits is not None:
-            jacobian = lanes(result.torque_limits[0], k, n, np.shape(result.torque_limits[0])[-1])
-            torque = lanes(result.torque_limits[1], jacobian.shape[-1])
-            valid &= np.isfinite(torque).all(-1) & (torque > 0).all(-1)
-            finite = np.isfinite(jacobian).all((-1, -2)) | ~live
-            valid &= finite.all(-1)
-            jacobian = np.where(live[..., None, None], jacobian, 0.0)
-        else:
-            jacobian, torque = np.zeros((lanes_total, k, n, 0)), np.zeros((lanes_total, 0))
-        cap = np.where(live, cap, np.inf)
-        load = np.concatenate([wrench[:, :dimension], wrench[:, dimension:] / known.length[:, None]], -1)
-        size = np.linalg.norm(load, axis=-1)
-        order = [known.normal_index, *(j for j in range(n) if j != known.normal_index)]
-        folded_jacobian = (jacobian * known.scale[..., None])[:, :, order]
-
-        # The forces: balanced, inside every cone, under every limit, at the stated cost.
-        force = np.where(live[..., None], force, 0.0)
-        s = scaled_force(force, known.scale, known.normal_index)
-        total = np.linalg.norm(s.reshape(lanes_total, -1), axis=-1)
-        norm = np.linalg.norm(known.A, axis=(-2, -1))
-        residual = np.linalg.norm(
-            np.einsum("lij,lj->li", known.A, s.reshape(lanes_total, -1)) + load, axis=-1
-        )
-        fine = FINE * eps
-        met = residual <= fine * (norm * total + size)
-        tails = np.linalg.norm(s[..., 1:], axis=-1)
-        met &= (np.where(live, s[..., 0] - tails, 0.0) >= -fine * total[:, None]).all(-1)
-        met &= (np.where(live, s[..., 0] - cap, -np.inf) <= fine * total[:, None]).all(-1)
-        torques = np.einsum("lkcj,lkc->lj", jacobian, force)
-        reach = np.linalg.norm(folded_jacobian, axis=(1, 2)) * total[:, None]
-        met &= (np.abs(torques) <= torque + fine * (reach + torque)).all(-1)
-
-        twist, rates = lanes(result.load_twist, m), lanes(result.joint_rates, torque.shape[-1])
-        y = np.concatenate([twist[:, :dimension], twist[:, dimension:] * known.length[:, None]], -1)
-        value, scale = _cost(known, name, s, weight, length, dimension)
-        best = _bound(known, name, s, weight, length, cap, torque, folded_jacobian, load, y, rates, dimension)
-        # What evaluating a bound from large multipliers can lose to rounding.
-        power = np.linalg.norm(y, axis=-1) * (size + norm * total) + np.sum(
-            np.abs(rates) * (torque + reach), -1
-        )
-        idle = total == 0  # no forces for no load: nothing is cheaper than 0
-        best = np.where(idle & (size == 0) & (weight is None), 0.0, best)
-        room = fine * np.maximum(scale, np.abs(value))
-        allowed = (CLOSE if tolerance is None else tolerance) * np.maximum(scale, np.abs(value)) + room
-        smooth = getattr(result, "smoothing", 0.0) or 0.0
-        allowed = np.maximum(allowed, 4 * smooth * (3 * k + 2 * torque.shape[-1]))
-        optimal = (
-            met
-            & (np.abs(value - cost) <= room + fine * _logarithmic(known, name, s, weight, dimension))
-            & (bound <= best + room + fine * power)
-            & (value - np.minimum(best, bound) <= allowed + room + fine * power)
-        )
-
-        # The twist: more work than any admissible forces can take up.
-        escape = lanes(result.escape_twist, m)
-        xi = np.concatenate([escape[:, :dimension], escape[:, dimension:] * known.length[:, None]], -1)
-        x = np.einsum("lkij,li->lkj", known.blocks, xi) + np.einsum("lkcj,lj->lkc", folded_jacobian, rates)
-        blur = np.linalg.norm(known.blocks, axis=(-2, -1)) * np.linalg.norm(xi, axis=-1)[:, None]
-        blur = blur + np.linalg.norm(folded_jacobian, axis=(-2, -1)) * np.linalg.norm(rates, axis=-1)[:, None]
-        short = np.linalg.norm(x[..., 1:], axis=-1) - x[..., 0] + ROUNDING * EPS * blur
-        most = np.minimum(cap, LIMIT * size[:, None])
-        taken = np.sum(np.where(live, np.maximum(short, 0.0) * most, 0.0), -1) + np.abs(rates * torque).sum(
-            -1
-        )
-        power = np.sum(xi * load, -1) - ROUNDING * EPS * np.linalg.norm(xi, axis=-1) * size
-        infeasible = power > taken
-
+        asked = _asked(grasp, result)
+        told = _told(asked, result)
+        fine = FINE * float(np.finfo(np.dtype(grasp.position.dtype)).eps)
+        smoothing = getattr(result, "smoothing", 0.0) or 0.0
+        optimal = _optimal(asked, told, fine, CLOSE if tolerance is None else tolerance, smoothing)
+        infeasible = _infeasible(asked, told)
     accepted = np.select(
         [status == OPTIMAL, status == INFEASIBLE, status == STALLED, status == INVALID],
-        [valid & optimal, valid & infeasible, valid, ~valid],
+        [asked.valid & optimal, asked.valid & infeasible, asked.valid, ~asked.valid],
         default=False,
     )
     return accepted.reshape(shape)[()]
 
 
-def _cost(known: Rebuilt, name: str, s, weight, length, dimension: int) -> tuple[np.ndarray, np.ndarray]:
-    """The criterion, and the size that rounding is relative to."""
-    head, live = s[..., 0], known.live
-    top = np.max(np.where(live, head, -np.inf), -1)
-    if name == "Gentlest":
-        return top, np.abs(top)
-    if name == "SmallestSum":
-        value = np.sum(np.where(live, head, 0.0), -1)
-        return value, np.abs(value)
-    if name == "Robust":
-        a, b, c = _log_det_terms(known, dimension)
-        tail = np.linalg.norm(s[..., 1:], axis=-1)
-        log_det = a * np.log(np.where(live, head, 1.0)) + c
-        log_det += np.where(b > 0, b * np.log(np.where(live, (head - tail) * (head + tail), 1.0)), 0.0)
-        logs = np.where(live, log_det, 0.0)
-        return top - weight * logs.sum(-1), np.abs(top) + weight * (1 + np.abs(logs).sum(-1))
-    value = np.sum(np.where(live[..., None], _curvatures(known, name, length) * s * s, 0.0), (-1, -2))
-    return value, value
+def _asked(grasp, result) -> Asked:
+    """The problem, from the grasp and from what the result says was asked."""
+    shape, dimension, k = np.shape(result.status), grasp.position.shape[-1], grasp.position.shape[-2]
+    lanes = int(np.prod(shape))
+    known = _repeated(rebuild(grasp), lanes // max(int(np.prod(grasp.position.shape[:-2])), 1))
+    live, n = known.live, len(known.components)
+
+    def rows(array, *own):
+        return np.asarray(array, np.float64).reshape(lanes, *own)
+
+    wrench = rows(result.wrench, 3 if dimension == 2 else 6)
+    cap = np.full((lanes, k), np.inf) if result.max_normal is None else rows(result.max_normal, k)
+    valid = known.valid & np.isfinite(wrench).all(-1) & ((cap > 0) | ~live).all(-1)
+    parameters = {name: getattr(result.criterion, name, None) for name in ("weight", "length")}
+    for name, value in parameters.items():
+        if value is not None:
+            value = rows(np.broadcast_to(value, shape))
+            valid &= np.isfinite(value) & (value > 0)
+            parameters[name] = value
+    jacobian, torque = np.zeros((lanes, k, n, 0)), np.zeros((lanes, 0))
+    if result.torque_limits is not None:
+        jacobian = rows(result.torque_limits[0], k, n, np.shape(result.torque_limits[0])[-1])
+        torque = rows(result.torque_limits[1], jacobian.shape[-1])
+        valid &= np.isfinite(torque).all(-1) & (torque > 0).all(-1)
+        valid &= (np.isfinite(jacobian).all((-1, -2)) | ~live).all(-1)
+        jacobian = np.where(live[..., None, None], jacobian, 0.0)
+    return Asked(
+        known=known,
+        name=type(result.criterion).__name__,
+        cap=np.where(live, cap, np.inf),
+        jacobian=jacobian,
+        torque=torque,
+        load=scaled_wrench(wrench, known.length, dimension),
+        valid=valid,
+        dimension=dimension,
+        **parameters,
+    )
 
 
-def _logarithmic(known: Rebuilt, name: str, s, weight, dimension: int) -> np.ndarray | float:
-    """What a relative error of the forces is worth in the robust cost: ``weight sum b f_n / (f_n - psi)``."""
-    if name != "Robust":
-        return 0.0
-    _, b, _ = _log_det_terms(known, dimension)
-    head, tail = s[..., 0], np.linalg.norm(s[..., 1:], axis=-1)
-    counted = known.live & (b > 0) & (head > tail)
-    return weight * np.sum(np.where(counted, b * head / np.where(counted, head - tail, 1.0), 0.0), -1)
+def _repeated(known: Rebuilt, loads: int) -> Rebuilt:
+    """Each grasp once for each of its loads."""
+    if loads == 1:
+        return known
+    arrays = {name: x for name, x in known._asdict().items() if isinstance(x, np.ndarray)}
+    return known._replace(**{name: np.repeat(x, loads, axis=0) for name, x in arrays.items()})
 
 
-def _bound(known, name, s, weight, length, cap, torque, jacobian, load, y, rates, dimension) -> np.ndarray:
-    """A lower bound of every admissible force's cost, from the twist y and the joint rates (formulas above)."""
-    live = known.live
-    x = np.einsum("lkij,li->lkj", known.blocks, y) + np.einsum("lkcj,lj->lkc", jacobian, rates)
-    gain = np.sum(y * load, -1) - np.sum(np.abs(rates) * torque, -1)
-    tail = np.linalg.norm(x[..., 1:], axis=-1)
-    rho = np.where(live, tail - x[..., 0], 0.0)
-    if name in ("SmallestSum", "Gentlest"):
-        short = np.maximum(rho, 0.0)
-        largest = short.max(-1) if name == "SmallestSum" else short.sum(-1)
-        scaled = np.where(largest > 0, gain / np.where(largest > 0, largest, 1.0), 0.0)
-        if name == "SmallestSum":
-            left = np.maximum(short - 1.0, 0.0)
-        else:
-            left = short - _top_share(short, cap)
-        paid = gain - _paid(left, cap, 0.0)
-        return np.maximum(np.maximum(scaled, paid), 0.0)
-    if name == "Robust":
-        return _robust_bound(known, s, weight, cap, x, gain, dimension)
-    half = _curvatures(known, name, length)
-    pushed = 2 * half[..., 1:] * s[..., 1:]
-    rho = np.maximum(np.linalg.norm(x[..., 1:] + pushed, axis=-1) - x[..., 0], 0.0)
-    spent = np.sum(pushed * s[..., 1:], -1)
-    best = np.minimum(rho / 2, cap)
-    return gain + np.sum(np.where(live, best * best - rho * best - spent / 2, 0.0), -1)
+def _told(asked: Asked, result) -> Told:
+    live, m, q = asked.known.live, asked.load.shape[-1], asked.torque.shape[-1]
+    lanes, k, n = *live.shape, len(asked.known.components)
+
+    def rows(array, *own):
+        return np.asarray(array, np.float64).reshape(lanes, *own)
+
+    force = np.where(live[..., None], rows(result.force, k, n), 0.0)
+    twists = rows(result.load_twist, m), rows(result.escape_twist, m)
+    return Told(force, rows(result.cost), rows(result.bound), *twists, rows(result.joint_rates, q))
 
 
-def _robust_bound(known: Rebuilt, s, weight, cap, x, gain, dimension: int) -> np.ndarray:
-    live = known.live
-    a, b, c = _log_det_terms(known, dimension)
-    phi, psi = 2 * weight[:, None] * b, weight[:, None] * a
-    head = np.where(live, s[..., 0], 0.0)
-    level = np.minimum(head.max(-1, keepdims=True), cap)
-    x_tail = np.linalg.norm(x[..., 1:], axis=-1)
-    z_head = np.where(phi > 0, (phi + np.hypot(phi, 2 * level * x_tail)) / (2 * level), x_tail)
-    needed = np.where(live, np.maximum(z_head + psi / level - x[..., 0], 0.0), 0.0)
-    p = psi / np.where(live & (needed <= 0), s[..., 0], level)
-    share = _top_share(needed, cap)
-    alpha = np.where(np.isfinite(cap), needed - share, 0.0)
-    leads = live & (head >= head.max(-1, keepdims=True))
-    spare = np.maximum(1.0 - share.sum(-1, keepdims=True), 0.0) * leads / leads.sum(-1, keepdims=True)
-    z_head = share + spare + alpha + x[..., 0]
-    # A contact without barrier only needs z in its cone.
-    p = np.where(phi > 0, p, z_head - x_tail)
-    z_head = z_head - p
-    z_det = (z_head - x_tail) * (z_head + x_tail)
+def _multipliers(asked: Asked, twist: np.ndarray, rates: np.ndarray) -> Multipliers:
+    y = scaled_twist(twist, asked.known.length, asked.dimension)
+    x = np.einsum("lkij,li->lkj", asked.known.blocks, y)
+    return Multipliers(y, rates, x + np.einsum("lkcj,lj->lkc", asked.scaled_jacobian(), rates))
 
-    def conjugate(floor, value, power):
-        safe = np.where(floor > 0, floor, 1.0)
-        logs = np.where(value > 0, np.log(np.where(value > 0, value, 1.0)), -np.inf)
-        return np.where(floor > 0, safe - safe * np.log(safe) + power * safe * logs, 0.0)
 
-    pieces = conjugate(phi, np.where(z_head > x_tail, z_det, 0.0), 0.5) + conjugate(psi, p, 1.0)
-    pieces = pieces - weight[:, None] * c
-    paid = np.sum(np.where(alpha > 0, alpha * np.where(np.isfinite(cap), cap, 0.0), 0.0), -1)
-    return gain - paid + np.sum(np.where(live, pieces, 0.0), -1)
+def _optimal(asked: Asked, told: Told, fine: float, tolerance: float, smoothing: float) -> np.ndarray:
+    """The forces are admissible and balanced, at the stated cost, which the bound nearly reaches."""
+    s = scaled_force(told.force, asked.known.scale, asked.known.normal_index)
+    total = np.linalg.norm(s.reshape(len(s), -1), axis=-1)
+    sizes = Sizes(
+        total,
+        np.linalg.norm(asked.load, axis=-1),
+        np.linalg.norm(asked.known.A, axis=(-2, -1)),
+        np.linalg.norm(asked.scaled_jacobian(), axis=(1, 2)) * total[:, None],
+    )
+    value, scale = cost(asked, s)
+    multipliers = _multipliers(asked, told.load_twist, told.joint_rates)
+    best = lower_bound(asked, multipliers, s)
+    # No forces for no load: nothing is cheaper than 0.
+    best = np.where((total == 0) & (sizes.load == 0) & (asked.weight is None), 0.0, best)
+    # What evaluating a bound from large multipliers can lose to rounding.
+    power = np.linalg.norm(multipliers.y, axis=-1) * (sizes.load + sizes.A * total)
+    power = power + np.sum(np.abs(told.joint_rates) * (asked.torque + sizes.reach), -1)
+    relative = np.maximum(scale, np.abs(value))
+    room = fine * relative
+    allowed = tolerance * relative + room
+    allowed = np.maximum(allowed, 4 * smoothing * (3 * s.shape[1] + 2 * asked.torque.shape[-1]))
+    return (
+        _admissible(asked, told.force, s, sizes, fine)
+        & (np.abs(value - told.cost) <= room + fine * robust_sensitivity(asked, s))
+        & (told.bound <= best + room + fine * power)
+        & (value - np.minimum(best, told.bound) <= allowed + room + fine * power)
+    )
+
+
+def _admissible(asked: Asked, force: np.ndarray, s: np.ndarray, sizes: Sizes, fine: float) -> np.ndarray:
+    """``A s + w = 0``, ``s_0 >= |s_t|``, ``s_0 <= cap``, ``|J^T f| <= tau``, all to rounding."""
+    live, edge = asked.known.live, fine * sizes.force[:, None]
+    applied = np.einsum("lij,lj->li", asked.known.A, s.reshape(len(s), -1))
+    residual = np.linalg.norm(applied + asked.load, axis=-1)
+    tails = np.linalg.norm(s[..., 1:], axis=-1)
+    torques = np.einsum("lkcj,lkc->lj", asked.jacobian, force)
+    return (
+        (residual <= fine * (sizes.A * sizes.force + sizes.load))
+        & (np.where(live, s[..., 0] - tails, 0.0) >= -edge).all(-1)
+        & (np.where(live, s[..., 0] - asked.cap, -np.inf) <= edge).all(-1)
+        & (np.abs(torques) <= asked.torque + fine * (sizes.reach + asked.torque)).all(-1)
+    )
+
+
+def _infeasible(asked: Asked, told: Told) -> np.ndarray:
+    """The load does more work along the twist than any admissible forces can take up."""
+    known, jacobian = asked.known, asked.scaled_jacobian()
+    xi, rates, x = _multipliers(asked, told.escape_twist, told.joint_rates)
+    speed, size = np.linalg.norm(xi, axis=-1), np.linalg.norm(asked.load, axis=-1)
+    blur = np.linalg.norm(known.blocks, axis=(-2, -1)) * speed[:, None]
+    blur = blur + np.linalg.norm(jacobian, axis=(-2, -1)) * np.linalg.norm(rates, axis=-1)[:, None]
+    violation = np.linalg.norm(x[..., 1:], axis=-1) - x[..., 0] + ROUNDING * EPS * blur
+    most = np.minimum(asked.cap, LIMIT * size[:, None])
+    taken = np.sum(np.where(known.live, np.maximum(violation, 0.0) * most, 0.0), -1)
+    taken = taken + np.abs(rates * asked.torque).sum(-1)
+    return np.sum(xi * asked.load, -1) - ROUNDING * EPS * speed * size > taken

@@ -6,7 +6,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["EPS", "RANK_TOLERANCE", "ROUNDING", "Rebuilt", "component_vectors", "rebuild", "scaled_force"]
+__all__ = [
+    "EPS",
+    "RANK_TOLERANCE",
+    "ROUNDING",
+    "Rebuilt",
+    "component_vectors",
+    "rebuild",
+    "scaled_force",
+    "scaled_twist",
+    "scaled_wrench",
+]
 
 ROUNDING = 16.0  # c
 RANK_TOLERANCE = 64.0  # in units of eps of the grasp's dtype, relative to the largest singular value
@@ -52,6 +62,16 @@ def scaled_force(force, scale, normal_index) -> np.ndarray:
         s = np.where(force == 0, 0.0, force / scale)
     tangential = np.delete(s, normal_index, -1)
     return np.concatenate([s[..., normal_index : normal_index + 1], tangential], -1)
+
+
+def scaled_twist(twist: np.ndarray, length: np.ndarray, dimension: int) -> np.ndarray:
+    """(v; L omega) of twists (N, m), lengths (N,)."""
+    return np.concatenate([twist[:, :dimension], twist[:, dimension:] * length[:, None]], -1)
+
+
+def scaled_wrench(wrench: np.ndarray, length: np.ndarray, dimension: int) -> np.ndarray:
+    """(F; tau / L) of wrenches (N, m), lengths (N,)."""
+    return np.concatenate([wrench[:, :dimension], wrench[:, dimension:] / length[:, None]], -1)
 
 
 class Rebuilt(NamedTuple):

@@ -15,13 +15,29 @@ gamma into the columns (A), and asks of each lane (theory section 2; prior art: 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from .rebuilt import EPS, RANK_TOLERANCE, ROUNDING, rebuild, scaled_force
+from .rebuilt import EPS, RANK_TOLERANCE, ROUNDING, Rebuilt, rebuild, scaled_force, scaled_twist
 
 __all__ = ["check_resistance"]
 
 RESISTANT, NOT_RESISTANT, MARGINAL, UNDECIDED, INVALID = 1, 2, 3, 4, 5
+BARE_CLAIM = 1e-8  # the |t*| that MARGINAL claims without a bracket
+LARGEST_CLAIM = 1e-3  # a bracket this wide claims nothing
+
+
+class Rank(NamedTuple):
+    """Singular values of A (N,), and what rounding leaves of them: in A itself, in the dtype of the grasp."""
+
+    smallest: np.ndarray
+    rounding: np.ndarray
+    tolerance: np.ndarray
+
+    @property
+    def full(self) -> np.ndarray:
+        return self.smallest > np.maximum(self.rounding, self.tolerance)
 
 
 def check_resistance(grasp, result, tolerance: float | None = None) -> np.ndarray:
@@ -37,76 +53,87 @@ def check_resistance(grasp, result, tolerance: float | None = None) -> np.ndarra
     """
     dtype = np.dtype(grasp.position.dtype)
     batch, k, dimension = grasp.position.shape[:-2], grasp.position.shape[-2], grasp.position.shape[-1]
-    m = 3 if dimension == 2 else 6
     known = rebuild(grasp)
-    valid, live, length, blocks, A = known.valid, known.live, known.length, known.blocks, known.A
-    n = len(known.components)
-
-    def lanes(array, *shape):
-        return np.asarray(array).reshape(-1, *shape)
-
-    status = lanes(result.status)
-    force = lanes(result.internal_force, k, n).astype(np.float64)
-    twist = lanes(result.escape_twist, m).astype(np.float64)
-
+    status = np.asarray(result.status).reshape(-1)
+    force = np.asarray(result.internal_force).reshape(-1, k, len(known.components)).astype(np.float64)
+    twist = np.asarray(result.escape_twist).reshape(-1, 3 if dimension == 2 else 6).astype(np.float64)
     with np.errstate(all="ignore"):
-        values = np.linalg.svd(A, compute_uv=False)
-        values = np.pad(values, [(0, 0), (0, m - values.shape[1])])
-        largest, smallest = values[:, 0], values[:, -1]
-        tiny = ROUNDING * EPS * largest
-        rank_tiny = RANK_TOLERANCE * float(np.finfo(dtype).eps) * largest
-        full_rank = smallest > np.maximum(tiny, rank_tiny)
-
-        # Primal evidence: how far the nearest exact internal force can leave the cones (yes), and its margin.
-        s = scaled_force(np.where(live[..., None], force, 0.0), known.scale, known.normal_index)
-        effort = np.sum(s[..., 0], -1)
-        s = s * np.where(effort > 0, live.sum(-1) / effort, np.nan)[:, None, None]
-        slack = np.min(np.where(live, s[..., 0] - np.linalg.norm(s[..., 1:], axis=-1), np.inf), -1)
-        residual = np.linalg.norm(np.einsum("lij,lj->li", A, s.reshape(len(s), -1)), axis=-1)
-        residual = residual + tiny * np.linalg.norm(s.reshape(len(s), -1), axis=-1)
-        shift = np.sqrt(2.0) * residual / (smallest - tiny)
-        resistant = full_rank & (smallest > tiny) & (shift < slack)
-
-        # Dual evidence: the twist's slack in the dual cones, in the metric (v, L omega).
-        xi = np.concatenate([twist[:, :dimension], twist[:, dimension:] * length[:, None]], -1)
+        rank = _rank(known, dtype)
+        slack, shift = _primal(known, rank, force)
+        xi = scaled_twist(twist, known.length, dimension)
         xi = xi / np.linalg.norm(xi, axis=-1, keepdims=True)
-        x = np.einsum("lkij,li->lkj", blocks, xi)
-        block_norm = np.linalg.norm(blocks, axis=(-2, -1))
-        depth = x[..., 0] - np.linalg.norm(x[..., 1:], axis=-1)
-        escapes = np.min(np.where(live, depth - ROUNDING * EPS * block_norm, np.inf), -1) > 0
-        unseen = np.linalg.norm(np.einsum("lij,li->lj", A, xi), axis=-1)
-        rank_deficient = (smallest <= np.maximum(tiny, rank_tiny)) & (
-            unseen <= np.maximum(tiny, 2 * rank_tiny)
-        )
-        escapes |= rank_deficient
-
-        # Both together: t* >= slack - shift, and t* <= 1 + a.y for the multiple of -xi that the dual admits.
-        if tolerance is None and not (hasattr(result, "margin") and hasattr(result, "gap")):
-            tolerance = 1e-8  # bare evidence claims no bracket
-        if tolerance is None:
-            margin, gap = lanes(result.margin).astype(np.float64), lanes(result.gap).astype(np.float64)
-            claimed = np.maximum(np.abs(margin), np.abs(margin + gap))
-            claim = np.where(claimed < 1e-3, np.maximum(claimed, 1e-8), 0.0)
-        else:
-            claim = np.full(len(status), float(tolerance))
-        floor = 2e4 * EPS if dtype.itemsize == 8 else 160 * float(np.finfo(dtype).eps)
-        resolution = np.maximum(claim, floor)
-        lower = slack - 2 * shift
-        total = np.sum(np.where(live, x[..., 0], 0.0), -1)
-        reach = np.max(np.where(live, np.linalg.norm(x[..., 1:], axis=-1) - x[..., 0], -np.inf), -1)
-        gauge = live.sum(-1) * reach + total  # rho(-xi): largest multiple admitted is 1 / gauge
-        upper = 1 - total / np.where(gauge > 0, gauge, np.nan)
-        marginal = full_rank & (lower >= -2 * resolution) & (upper <= 2 * resolution)
-
+        resistant = rank.full & (rank.smallest > rank.rounding) & (shift < slack)
+        escapes = _escapes(known, rank, xi)
+        # Both together: t* >= slack - shift, and t* <= upper.
+        resolution = np.maximum(_claim(result, tolerance), _floor(dtype))
+        small = (slack - 2 * shift >= -2 * resolution) & (_upper(known, xi) <= 2 * resolution)
+    valid = known.valid
     accepted = np.select(
-        [
-            status == RESISTANT,
-            status == NOT_RESISTANT,
-            status == MARGINAL,
-            status == UNDECIDED,
-            status == INVALID,
-        ],
-        [valid & resistant, valid & escapes, valid & marginal, valid, ~valid],
+        [status == s for s in (RESISTANT, NOT_RESISTANT, MARGINAL, UNDECIDED, INVALID)],
+        [valid & resistant, valid & escapes, valid & rank.full & small, valid, ~valid],
         default=False,
     )
     return accepted.reshape(batch)[()]
+
+
+def _rank(known: Rebuilt, dtype: np.dtype) -> Rank:
+    m = known.A.shape[1]
+    values = np.linalg.svd(known.A, compute_uv=False)
+    values = np.pad(values, [(0, 0), (0, m - values.shape[1])])
+    largest = values[:, 0]
+    tolerance = RANK_TOLERANCE * float(np.finfo(dtype).eps) * largest
+    return Rank(values[:, -1], ROUNDING * EPS * largest, tolerance)
+
+
+def _primal(known: Rebuilt, rank: Rank, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far the internal force lies inside the cones, and how far off the nearest exact one may be."""
+    live = known.live
+    s = scaled_force(np.where(live[..., None], force, 0.0), known.scale, known.normal_index)
+    effort = np.sum(s[..., 0], -1)
+    s = s * np.where(effort > 0, live.sum(-1) / effort, np.nan)[:, None, None]
+    slack = np.min(np.where(live, s[..., 0] - np.linalg.norm(s[..., 1:], axis=-1), np.inf), -1)
+    flat = s.reshape(len(s), -1)
+    residual = np.linalg.norm(np.einsum("lij,lj->li", known.A, flat), axis=-1)
+    residual = residual + rank.rounding * np.linalg.norm(flat, axis=-1)
+    return slack, np.sqrt(2.0) * residual / (rank.smallest - rank.rounding)
+
+
+def _velocities(known: Rebuilt, xi: np.ndarray) -> np.ndarray:
+    """x_i = A_i^T xi (N, k, n), normal first."""
+    return np.einsum("lkij,li->lkj", known.blocks, xi)
+
+
+def _escapes(known: Rebuilt, rank: Rank, xi: np.ndarray) -> np.ndarray:
+    """The twist is inside every (self-dual) cone by more than rounding, or it spans the null space of A^T."""
+    x = _velocities(known, xi)
+    depth = x[..., 0] - np.linalg.norm(x[..., 1:], axis=-1)
+    rounding = ROUNDING * EPS * np.linalg.norm(known.blocks, axis=(-2, -1))
+    inside = np.min(np.where(known.live, depth - rounding, np.inf), -1) > 0
+    unseen = np.linalg.norm(np.einsum("lij,li->lj", known.A, xi), axis=-1)
+    deficient = rank.smallest <= np.maximum(rank.rounding, rank.tolerance)
+    return inside | (deficient & (unseen <= np.maximum(rank.rounding, 2 * rank.tolerance)))
+
+
+def _upper(known: Rebuilt, xi: np.ndarray) -> np.ndarray:
+    """The upper bound 1 + a.y of t* for the largest multiple of -xi that the dual admits."""
+    x, live = _velocities(known, xi), known.live
+    total = np.sum(np.where(live, x[..., 0], 0.0), -1)
+    reach = np.max(np.where(live, np.linalg.norm(x[..., 1:], axis=-1) - x[..., 0], -np.inf), -1)
+    gauge = live.sum(-1) * reach + total  # rho(-xi): that multiple is 1 / gauge
+    return 1 - total / np.where(gauge > 0, gauge, np.nan)
+
+
+def _claim(result, tolerance: float | None) -> np.ndarray | float:
+    """The |t*| that MARGINAL claims."""
+    if tolerance is not None:
+        return float(tolerance)
+    if not (hasattr(result, "margin") and hasattr(result, "gap")):
+        return BARE_CLAIM
+    margin, gap = (np.asarray(x).reshape(-1).astype(np.float64) for x in (result.margin, result.gap))
+    claimed = np.maximum(np.abs(margin), np.abs(margin + gap))
+    return np.where(claimed < LARGEST_CLAIM, np.maximum(claimed, BARE_CLAIM), 0.0)
+
+
+def _floor(dtype: np.dtype) -> float:
+    """The resolution of a dtype."""
+    return 2e4 * EPS if dtype.itemsize == 8 else 160 * float(np.finfo(dtype).eps)

@@ -76,7 +76,7 @@ def advance_linear_cone_program(
     point = jax.tree.map(lambda new, old: jnp.where(taken, new, old), moved, state.point)
     stalled = STALL.count(taken & STALL.slow(gap, state.gap), state.stalled)
     goal = tolerance * jnp.maximum(jnp.ones_like(gap), jnp.abs(program.dual_value(point.y)))
-    reasons = [
+    table = [
         (taken & (gap <= goal), Status.CONVERGED),
         *([] if decided is None else [(taken & decided(program, point), Status.DECIDED)]),
         (~inside, Status.BREAKDOWN),
@@ -87,7 +87,7 @@ def advance_linear_cone_program(
         jnp.where(taken, gap, state.gap),
         jnp.where(running, state.iterations + 1, state.iterations),
         stalled,
-        jnp.where(running, first_of(reasons, Status.RUNNING), state.stop),
+        jnp.where(running, first_of(table, Status.RUNNING), state.stop),
     )
     return after, step
 

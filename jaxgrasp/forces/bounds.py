@@ -108,8 +108,8 @@ def _level_multipliers(violation: Array, cap: Array | None, total: Array) -> Arr
             else:
                 first = (cap[j] > cap[i]) | ((cap[j] == cap[i]) & (j < i))
                 before = before + jnp.where(first, violation[j], jnp.zeros_like(total))
-        left = jnp.maximum(total - before, jnp.zeros_like(total))
-        rows.append(jnp.minimum(left, violation[i]))
+        remaining = jnp.maximum(total - before, jnp.zeros_like(total))
+        rows.append(jnp.minimum(remaining, violation[i]))
     return jnp.stack(rows)
 
 
@@ -139,9 +139,9 @@ def _quadratic_bound(program: ConvexConeProgram, dual: DualPoint, u: Cone) -> Ar
     curvature: Curvature | None = program.curvature
     assert curvature is not None
     exists = program.exists
-    pushed = curvature.apply(u)
-    x = (dual.x[0], *(a + b for a, b in zip(dual.x[1:], pushed[1:], strict=True)))
-    spent = inner(u, pushed) - u[0] * pushed[0]
+    tangent = curvature.apply(u)
+    x = (dual.x[0], *(a + b for a, b in zip(dual.x[1:], tangent[1:], strict=True)))
+    spent = inner(u, tangent) - u[0] * tangent[0]
     rho = jnp.maximum(tail_norm(x) - x[0], jnp.zeros_like(x[0]))
     flat = jnp.where(exists > 0, curvature.head, jnp.ones_like(exists))
     best = rho / flat

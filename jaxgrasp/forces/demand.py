@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from ..contacts import Contacts, Grasp, TorqueLimits, contacts_of
-from ..core import Array, real_array, wrench_dimension
+from ..core import Array, real_array, spread, wrench_dimension
 from .criteria import Criterion
 from .problem import Demand
 
@@ -35,23 +35,11 @@ def spread_loads(grasp: Grasp, wrench: Any) -> tuple[Array, tuple[int, ...]]:
     return jnp.broadcast_to(array, (*shape, m)), shape
 
 
-def _spread(
-    value: Array, own: tuple[int, ...], batch: tuple[int, ...], shape: tuple[int, ...], name: str
-) -> Array:
-    """``value`` with trailing axes ``own`` broadcast over ``batch``, then over the load axes."""
-    loads = len(shape) - len(batch)
-    try:
-        full = jnp.broadcast_to(value, (*batch, *own))
-    except ValueError as error:
-        raise ValueError(f"{name} must broadcast to shape {(*batch, *own)}, got {value.shape}") from error
-    return jnp.broadcast_to(full.reshape(*batch, *([1] * loads), *own), (*shape, *own))
-
-
 def _weight(value: Array, batch: tuple[int, ...], shape: tuple[int, ...]) -> Array:
     """One per problem: from one for all, one per grasp, or one per load."""
     if value.ndim == len(shape) > len(batch):
         return jnp.broadcast_to(value, shape)
-    return _spread(value, (), batch, shape, "the criterion's weight")
+    return spread(value, (), batch, "the criterion's weight", shape[len(batch) :])
 
 
 def demand_rows(
@@ -62,19 +50,21 @@ def demand_rows(
     max_normal: Any,
     torque_limits: Any,
 ) -> tuple[Contacts, Demand]:
+    """Contacts and demand with one row for each problem of ``shape``; ValueError where a value does not fit."""
     batch, k, dtype = grasp.batch_shape, grasp.contacts, grasp.dtype
+    loads = shape[len(batch) :]
     n = grasp.model.force_size(grasp.dimension)
     contacts = contacts_of(grasp)
-    spread = Contacts(*(_spread(x, x.shape[len(batch) :], batch, shape, "grasp") for x in contacts))
+    rows = Contacts(*(spread(x, x.shape[len(batch) :], batch, "grasp", loads) for x in contacts))
     criterion = jax.tree.map(lambda x: _weight(x.astype(dtype), batch, shape), criterion)
     log_det = None
     if criterion.barrier_weight is not None:
         terms = grasp.model.log_det_terms(grasp.dimension)
-        a, b, c = (_spread(x.astype(dtype), (k,), batch, shape, "grasp") for x in terms)
+        a, b, c = (spread(x.astype(dtype), (k,), batch, "grasp", loads) for x in terms)
         log_det = (a, b, c)
     cap = None
     if max_normal is not None:
-        cap = _spread(real_array(max_normal, "max_normal").astype(dtype), (k,), batch, shape, "max_normal")
+        cap = spread(real_array(max_normal, "max_normal").astype(dtype), (k,), batch, "max_normal", loads)
     jacobian = torque = None
     if isinstance(torque_limits, TorqueLimits):
         torque_limits = torque_limits.in_contact_axes(grasp)
@@ -92,6 +82,6 @@ def demand_rows(
                 f"({k} contacts of {n}), one column for each joint, got {jacobian.shape}"
             )
         joints = jacobian.shape[-1]
-        jacobian = _spread(jacobian, (k * n, joints), batch, shape, "the hand Jacobian J")
-        torque = _spread(real_array(torque, "tau_max").astype(dtype), (joints,), batch, shape, "tau_max")
-    return spread, Demand(wrench, criterion, log_det, cap, jacobian, torque)
+        jacobian = spread(jacobian, (k * n, joints), batch, "the hand Jacobian J", loads)
+        torque = spread(real_array(torque, "tau_max").astype(dtype), (joints,), batch, "tau_max", loads)
+    return rows, Demand(wrench, criterion, log_det, cap, jacobian, torque)

@@ -133,9 +133,9 @@ class Verdicts:
     @classmethod
     def of(cls, answer: WrenchResistance, rows: Any = slice(None)) -> Verdicts:
         """The columns of the ``rows`` of an answer: a slice, numbers or a mask."""
-        names = ("status", "margin", "rank", "internal_force", "escape_twist", "iterations")
+        names = ("status", "upper", "rank", "internal_force", "escape_twist", "iterations")
         columns = {name: np.asarray(getattr(answer, name))[rows] for name in names}
-        return cls(upper=columns["margin"] + np.asarray(answer.gap)[rows], **columns)
+        return cls(margin=np.asarray(answer.lower)[rows], **columns)
 
 
 def verdict_schema(fingers: int, dtype: str, metadata: dict[str, Any] | None = None) -> pa.Schema:

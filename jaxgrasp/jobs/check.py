@@ -171,7 +171,7 @@ def _disturbed(
         disturbance=np.tile(push, (1, n, 1)),
         gravity=gravity,
     )
-    settled = np.asarray(out.settled(NEAR, float(LEVEL)))
+    settled = np.asarray(out.settled(position=NEAR, orientation=float(LEVEL)))
     fine = (Status.COMMANDED.value, Status.PROJECTED.value)
     good = np.isin(np.asarray(out.status), fine).all(axis=0) & (settled < STEPS)
     use = np.asarray(out.cone_use).max(axis=0)

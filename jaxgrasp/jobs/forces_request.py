@@ -145,7 +145,8 @@ def _load(request: ForcesRequest, dimension: int) -> Load:
 def _status(name: str | None) -> Status | None:
     if name is None:
         return None
-    names = {status.name.replace("_", "-").lower(): status for status in Status}
+    known = (Status(value) for value in range(Status.RESISTANT, Status.STALLED + 1))
+    names = {status.name.replace("_", "-").lower(): status for status in known}
     if name not in names:
         raise UserError(f"unknown status {name!r}; take one of {', '.join(names)}")
     return names[name]
@@ -173,7 +174,7 @@ def _source(name: str) -> GraspFile | SavedGrasps:
 
 def plan_forces(request: ForcesRequest) -> ForcesPlan:
     """Check the request and open its source. UserError: one line saying what to do."""
-    criterion = make_criterion(request.criterion, request.weight, request.length)
+    criterion = make_criterion(request.criterion, weight=request.weight, length=request.length)
     status = _status(request.status)
     positive_option("tolerance", request.tolerance)
     positive_option("max-normal", request.max_normal)

@@ -17,6 +17,7 @@ from ..core import (
     Array,
     Bool,
     Float,
+    Index,
     Int,
     Status,
     applied,
@@ -58,7 +59,7 @@ class ClosedLoop(Answer):
         Status.INVALID: "Invalid: the numbers are not a grasp, a body and a state; no forces are applied.",
     }
 
-    def __getitem__(self, index: Any) -> ClosedLoop:
+    def __getitem__(self, index: Index) -> ClosedLoop:
         """The loops at ``index`` of the batch, all steps of each."""
         if len(self.batch_shape) < 2:
             raise IndexError("a single loop has no batch axis to index")
@@ -77,7 +78,7 @@ class ClosedLoop(Answer):
         """(*batch) bool: some step had no admissible forces for its command, or its forces were projected."""
         return jnp.any(self.status != Status.COMMANDED.value, axis=0)
 
-    def settled(self, position: float, orientation: float) -> Int[Array, "*batch"]:
+    def settled(self, *, position: float, orientation: float) -> Int[Array, "*batch"]:
         """The first step from which both errors stay below ``position`` m and ``orientation`` rad; T if never."""
         out = ~((self.position_error <= position) & (self.orientation_error <= orientation))
         steps = jnp.arange(1, out.shape[0] + 1, dtype=jnp.int32).reshape(-1, *[1] * (out.ndim - 1))
@@ -109,14 +110,17 @@ def _run(setting: _Setting, state: BodyState, reference: Reference, pushes, step
     def step(carry: tuple[BodyState, Array], at: tuple[Any, Any]) -> tuple[Any, Any]:
         now, last = carry
         target = at[0] if moving else reference
-        command = controller.command(grasp, body, now, target, last, gravity)
+        command = controller.command(grasp, body, now, reference=target, last=last, gravity=gravity)
         invalid = ((command.status == Status.INVALID.value) | ~sound)[..., None]
         status = jnp.where(sound, command.status, jnp.int32(Status.INVALID.value))
         command = command._replace(force=jnp.where(invalid, 0.0, command.force), status=status)
         wrench = rotate_wrench(now.orientation, applied(G, command.force))
         if at[1] is not None:
             wrench = wrench + at[1]
-        after = advance(body, now, wrench, timestep, gravity) if plant is None else plant.advance(now, wrench)
+        if plant is None:
+            after = advance(body, now, wrench, timestep=timestep, gravity=gravity)
+        else:
+            after = plant.advance(now, wrench)
         after = jax.tree.map(lambda new, old: jnp.where(invalid, old, new), after, now)
         error = tracking_error(now, target).error
         normal = command.force.reshape(*command.force.shape[:-1], grasp.contacts, -1)[..., index]

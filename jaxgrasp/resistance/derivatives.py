@@ -85,7 +85,7 @@ class _Form(NamedTuple):
 
 
 def _program(form: _Form, contacts: Contacts, scales: Scales) -> ConvexConeProgram:
-    """``margin.margin_program`` of A itself as a differentiable function of the contacts."""
+    """``margin_program`` of A itself as a differentiable function of the contacts."""
     program = margin_program(fold(contacts, form.components, scales.length))
     none = (None,) * 7
     return ConvexConeProgram(program.columns, jnp.stack(program.rhs), program.exists, program.cost[0], *none)

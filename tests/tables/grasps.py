@@ -74,3 +74,10 @@ def random_rotation(rng: np.random.Generator, dimension: int = 3) -> np.ndarray:
     if np.linalg.det(q) < 0:
         q[:, 0] = -q[:, 0]
     return q
+
+
+def ball(rng, count, k, tilt=0.3):
+    """Hard fingers on a unit sphere with tilted normals: position, normal, friction."""
+    position = rng.normal(size=(count, k, 3))
+    position /= np.linalg.norm(position, axis=-1, keepdims=True)
+    return position, -position + tilt * rng.normal(size=position.shape), rng.uniform(0.3, 0.8, (count, k))

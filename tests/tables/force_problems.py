@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from families import random_active, random_coefficients, random_contacts
+from grasps import random_active, random_coefficients, random_contacts
 
 import jaxgrasp as jg
 

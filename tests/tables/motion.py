@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
-from families import random_rotation
+from grasps import random_rotation
 
 import jaxgrasp as jg
 
