@@ -43,7 +43,7 @@ def optimum(make, smoothing=0.0):
             tolerance=1e-12,
             smoothing=smoothing,
         )
-        values = {"value": out.cost, "bound": out.bound, "force": out.force, "twist": out.load_twist}
+        values = {"value": out.cost, "bound": out.lower, "force": out.force, "twist": out.load_twist}
         if limits is not None:
             values["rates"] = out.joint_rates
         return values, out.status == Status.OPTIMAL, out.smooth
