@@ -23,6 +23,6 @@ for motor in (8.0, 6.5, 5.0):  # N, of both jaws together
     print(f"motor of {motor} N: {jg.Status(int(answer.status)).name}, proved again: {proved}")
 
 # prints:
-# motor of 8.0 N: Optimal: the forces balance the load inside every cone, and the bound proves the cost. Cost between 3 and 3. Proved again: True
-# motor of 6.5 N: Optimal: the forces balance the load inside every cone, and the bound proves the cost. Cost between 3 and 3. Proved again: True
-# motor of 5.0 N: Infeasible: no admissible forces balance the load; along the escape twist the load does work that no force can take up. Proved again: True
+# motor of 8.0 N: OPTIMAL, proved again: True
+# motor of 6.5 N: OPTIMAL, proved again: True
+# motor of 5.0 N: INFEASIBLE, proved again: True

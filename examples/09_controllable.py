@@ -21,10 +21,7 @@ for lane, name in enumerate(("above", "through")):
 
 # prints:
 # Fingers above the centre of mass:
-# Controllable though not wrench resistant: with the forces strictly inside their cones, small changes of them and gravity together reach every motion.
-# The fingers alone reach 5 of 6 directions, with gravity 6; the controllability matrix has rank 12 of 12.
-# The state hardest to reach takes 326 times the weight, root mean square of all contact forces in units of their friction cones, for one radius of gyration in the time sqrt(l / g).
+# CONTROLLABLE rank 12 of 12
 # Fingers through the centre of mass:
-# Not controllable to first order: no small change of the contact forces affects the uncontrollable motion.
-# The fingers alone reach 5 of 6 directions, with gravity 5; the controllability matrix has rank 10 of 12.
+# NOT_CONTROLLABLE rank 10 of 12
 # Out of reach: a rotation about the axis along (1, 0, 0) through the centre of mass.

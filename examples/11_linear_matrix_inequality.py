@@ -23,7 +23,7 @@ print(f"margin by cones {by_cones:.6f}, by the LMI {by_lmi:.6f}")
 
 # No x makes [[x, 1], [1, -1]] positive semidefinite; the multiplier proves it.
 constant, one = np.array([[0.0, 1.0], [1.0, -1.0]]), np.array([[[1.0, 0.0], [0.0, 0.0]]])
-print("infeasible:", bool(jg.lmi.lmi_feasibility(constant, one).infeasible))
+print(jg.lmi.lmi_feasibility(constant, one).sentence())
 
 # prints:
 # S_1 .. S_9: (9, 9, 9)
@@ -31,4 +31,4 @@ print("infeasible:", bool(jg.lmi.lmi_feasibility(constant, one).infeasible))
 # f_x = 0.5 N: least eigenvalue of P(f) 0.000
 # f_x = 0.8 N: least eigenvalue of P(f) -0.300
 # margin by cones 1.000000, by the LMI 1.000000
-# infeasible: True
+# Infeasible: the matrix is positive semidefinite nowhere in reach of the certificate.

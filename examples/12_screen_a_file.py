@@ -6,14 +6,14 @@ from pathlib import Path
 import jax
 import pyarrow.parquet as pq
 
-from jaxgrasp.jobs import Request, prepare_screen, screen
+from jaxgrasp.jobs import ScreenRequest, plan_screen, screen
 
 jax.config.update("jax_enable_x64", True)  # 64-bit; without it JAX computes in float32
 
 with tempfile.TemporaryDirectory() as folder:
     file = Path(folder) / "mug.parquet"
     # On the command line: jaxgrasp screen mug --fingers 3 --samples 2000 -o mug.parquet
-    summary = screen(prepare_screen(Request("mug", file, fingers=3, samples=2000)))
+    summary = screen(plan_screen(ScreenRequest("mug", file, fingers=3, samples=2000)))
     best = pq.read_table(file, filters=[("status", "=", 1)]).sort_by([("margin", "descending")])
 
 print(f"{summary.rows} grasps, {best.num_rows} hold")

@@ -111,13 +111,12 @@ def test_the_summary_is_printed(placed, capsys):
     assert "written to box.placed.parquet" in said
 
 
-@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes(placed, tmp_path):
     assert main(["place", "box", *FEW, "-o", "again.parquet"]) == 0
     assert (tmp_path / "again.parquet").read_bytes() == placed[0].read_bytes()
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_the_grasps_in_the_file_hold_when_solved_again")
 @pytest.mark.parametrize(
     "objective",
     [

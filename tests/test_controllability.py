@@ -78,7 +78,6 @@ def answers():
     return grasp, jg.controllability(grasp, BODY, gravity=(0, 0, -9.81), force=force)
 
 
-@pytest.mark.slow
 def test_the_equilibrium_is_found_when_no_forces_are_given(answers):
     grasp, given = answers
     found = jg.controllability(grasp, BODY)
@@ -344,7 +343,6 @@ def test_ranks_are_those_of_exact_arithmetic():
     assert set(found.tolist()) >= {4, 5, 6}
 
 
-@pytest.mark.slow
 def test_verdicts_do_not_depend_on_axes_or_units(answers):
     rng = np.random.default_rng(41)
     grasp, found = answers
@@ -457,7 +455,7 @@ PLANAR = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_fixed_cases")
 def test_planar_cases():
     grasp = stacked(PLANAR.values(), 3, 2)
     force = carrying(grasp, np.array([0, -0.2 * 9.81, 0]))

@@ -80,7 +80,7 @@ def test_a_sweep_of_factors():
         jg.quality.friction_sweep(grasp, factors[None])
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_two_planar_fingers_need_the_tangent_of_the_larger_angle")
 def test_spatial_grasps_against_bisection_with_clarabel():
     position, normal, friction = ball(np.random.default_rng(8), 500, 4)
     grasp = jg.Grasp(position, normal, jg.HardFinger(friction))
@@ -96,7 +96,7 @@ def test_spatial_grasps_against_bisection_with_clarabel():
             assert sign * margin > -1e-8, (i, share, margin)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_derivatives_of_the_planar_pair")
 def test_spatial_derivatives_against_differences():
     position, normal, friction = ball(np.random.default_rng(9), 24, 4)
 

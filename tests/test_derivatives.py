@@ -209,7 +209,7 @@ def test_hessian_against_differences_of_the_gradient(name):
     assert left == pytest.approx(float(mixed), rel=1e-5, abs=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_hessian_against_differences_of_the_gradient")
 def test_jax_hessian_is_symmetric_and_equals_the_products():
     """jax.hessian of one grasp's cost in its positions, entry by entry."""
     x = {k: v[0] for k, v in as_arrays(without_limits(planar_problem, seed=3)).items()}

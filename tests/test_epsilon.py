@@ -8,6 +8,7 @@ import pytest
 from grasps import ball
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
+from shapes import HARD, PLANAR
 
 import jaxgrasp as jg
 from jaxgrasp import Status
@@ -89,7 +90,7 @@ def test_pyramids_inside_and_outside_agree(grasp, answer):
         assert float(answer.lower[i]) <= outer * (1 + 1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_pyramids_inside_and_outside_agree")
 def test_a_hundred_grasps_against_pyramids_of_32_edges():
     rng = np.random.default_rng(1)
     position, normal, friction = ball(rng, 400, 4)
@@ -106,12 +107,11 @@ def test_a_hundred_grasps_against_pyramids_of_32_edges():
 
 
 def two_planar(mu):
-    """Opposite fingers at (-1, 0) and (1, 0), and two places left empty."""
-    position = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
-    return jg.Grasp(position, -position, jg.HardFinger(mu), np.array([True, True, False, False]))
+    """Opposite fingers at (-1, 0) and (1, 0), and a place left empty."""
+    position = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    return jg.Grasp(position, -position, jg.HardFinger(mu), np.array([True, True, False]))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("mu", [0.2, 1.0])
 def test_two_opposite_planar_fingers(mu):
     """W is the tetrahedron of (1, +-mu, -+mu), (-1, +-mu, +-mu): its faces lie at mu / sqrt(mu^2 + 2)."""
@@ -120,7 +120,15 @@ def test_two_opposite_planar_fingers(mu):
     assert float(q.lower) == pytest.approx(exact, rel=1e-9)
     assert float(q.upper) == pytest.approx(exact, rel=1e-9)
     assert jg.check(two_planar(mu), q)
-    # With every force up to 1 both edges of both cones can push at once: twice the L1 ball or more.
+
+
+@pytest.mark.slow(
+    "test_two_opposite_planar_fingers", "test_spatial_linf_against_support_directions_and_linear_programs"
+)
+@pytest.mark.parametrize("mu", [0.2, 1.0])
+def test_two_opposite_planar_fingers_with_bounds_of_their_own(mu):
+    """With every force up to 1 both edges of both cones can push at once: twice the L1 ball or more."""
+    exact = mu / np.sqrt(mu**2 + 2)
     both = jg.epsilon_quality(two_planar(mu), norm="Linf", certificate=True)
     assert float(both.lower) >= exact * (1 - 1e-9)
     assert jg.check(two_planar(mu), both)
@@ -140,7 +148,7 @@ def resisted_multiple(wide, limits, equal, w):
     return -out.fun
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_spatial_linf_against_support_directions_and_linear_programs")
 def test_linf_ball_is_resisted_and_no_larger_one():
     """The lower ball by linear programs, exact in the plane, the upper bound by 10^5 support directions."""
     rng = np.random.default_rng(3)
@@ -232,9 +240,11 @@ def test_nothing_depends_on_axes_order_or_units(grasp, answer):
         assert (np.asarray(q.lower) <= np.asarray(answer.upper)[chosen] * (1 + 1e-9)).all()
 
 
-@pytest.mark.slow
-def test_jit_and_vmap_give_the_same_bits_and_bad_lanes_stay_alone(grasp, answer):
-    eager = jg.epsilon_quality(grasp[:8])
+@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
+def test_jit_and_vmap_give_the_same_bits_and_bad_lanes_stay_alone(dimension):
+    position, normal, friction = ball(np.random.default_rng(0), 12, PLANAR if dimension == 2 else HARD)
+    grasp = jg.Grasp(position[..., :dimension], normal[..., :dimension], jg.HardFinger(friction))
+    answer, eager = jg.epsilon_quality(grasp), jg.epsilon_quality(grasp[:8])
     traced = jax.jit(jg.epsilon_quality)(grasp[:8])
     mapped = jax.vmap(jg.epsilon_quality)(grasp[:8])
     for other in (traced, mapped):
@@ -251,7 +261,9 @@ def test_jit_and_vmap_give_the_same_bits_and_bad_lanes_stay_alone(grasp, answer)
     np.testing.assert_array_equal(np.asarray(broken.upper)[others], np.asarray(eager.upper)[others])
 
 
-@pytest.mark.slow
+@pytest.mark.slow(
+    "test_the_checker_accepts_and_finds_every_fault", "test_the_touching_forces_are_the_worst_wrench"
+)
 @pytest.mark.parametrize("norm", ["L1", "Linf"])
 @pytest.mark.parametrize("name", ["soft", "frictionless", "mixed and padded"])
 def test_every_contact_model(norm, name):

@@ -35,7 +35,15 @@ def test_an_example_is_short_and_asks_a_question(path):
     assert shown
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+# Compiling a placement takes longest by far; tests/test_placement.py asserts on a ball what this one prints of a mug.
+DEAR = ("08_place_on_a_mug",)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(p, marks=[pytest.mark.slow] * (p.stem in DEAR)) for p in EXAMPLES],
+    ids=lambda path: path.stem,
+)
 def test_an_example_prints_what_it_shows(path):
     """Equal words; numbers equal to 1 %."""
     _, shown = parts(path)

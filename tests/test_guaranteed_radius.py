@@ -89,7 +89,7 @@ def test_no_random_attack_succeeds():
     check_random_attacks(jg.Grasp(position, normal, jg.HardFinger(friction)), rng, attacks=10)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_no_random_attack_succeeds")
 @pytest.mark.parametrize("name", ["hard 3", "hard 4", "hard 6", "soft", "planar"])
 def test_a_hundred_thousand_attacks(name):
     """25 000 for each kind."""

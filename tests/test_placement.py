@@ -109,7 +109,7 @@ def test_mistakes_are_answered():
         placement.place_contacts(BALL, search=Search(4), requirements=[Within(lambda p: p[0] - 5.0)])
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_settling.py::test_no_number_is_no_improvement")
 def test_a_start_without_numbers_ends_alone():
     out = placement.place_contacts(BALL, fingers=3, requirements=(NotNumbers(),), search=Search(24, steps=60))
     assert len(out.value) > 0
@@ -124,7 +124,10 @@ def test_a_start_does_not_depend_on_how_many_there_are(placed):
     assert fewer.end.tobytes() == out.end[:10].tobytes()
 
 
-@pytest.mark.slow
+@pytest.mark.slow(
+    "test_objectives.py::test_the_bank_finds_the_weakest_direction",
+    "test_objectives.py::test_the_floor_is_below_epsilon_and_ranks_like_it",
+)
 def test_epsilon_as_the_objective_on_an_ellipsoid():
     """What is climbed grows, beyond what its guide reaches; the numbers are those of ``epsilon_quality``."""
     surface = surfaces.Ellipsoid(jnp.array([0.03, 0.04, 0.06]))
@@ -148,7 +151,7 @@ def test_epsilon_as_the_objective_on_an_ellipsoid():
     assert (np.diff(climbed.value) <= 0).all()
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_three_fingers_climb_to_the_equator_of_a_ball")
 @pytest.mark.parametrize(
     ("measure", "gains"),
     [
@@ -175,7 +178,7 @@ def test_any_measure_climbs(measure, gains):
         assert median(climbed) >= median(margin) > 0
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_three_fingers_climb_to_the_equator_of_a_ball")
 def test_most_starts_on_the_mug_end_resistant():
     out = placement.place_contacts(surfaces.of("mug", resolution=64), fingers=4, search=Search(128))
     assert out.resistant.mean() > 0.95

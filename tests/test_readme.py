@@ -110,7 +110,7 @@ def test_the_forces_example_prints_what_is_shown(tmp_path):
     same_words(block("forces example output"), printed)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_the_forces_example_prints_what_is_shown")
 def test_the_motion_example_prints_what_is_shown(tmp_path):
     same_words(block("motion example output"), run("-c", block("motion example"), cwd=tmp_path))
 

@@ -103,7 +103,7 @@ def test_nowhere_to_go_leaves_contacts_alone(ball):
     assert np.isfinite(normal).all()
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_contacts_come_to_rest_nearest_to_their_targets")
 def test_placement_on_large_facets_gains_by_settling():
     """Facets of an icosahedron: the smooth surface that is climbed is another body than the one that is grasped."""
     surface = coarse(0)

@@ -75,13 +75,14 @@ def functions(collected):
 
 
 def test_every_slow_test_has_a_fast_brother(collected):
-    """Cases of its own that are fast, or the test of the same file that its mark names: the same asserted on less."""
+    """Cases of its own that are fast, or the tests that its mark names: the same asserted on less, or in the plane."""
     fast, brothers = functions(collected)
     alone = []
     for (file, function), named in brothers.items():
         if (file, function) in fast and not named:
             continue
-        if not named or not {(file, name) for name in named} <= fast:
+        where = {tuple(name.split("::")) if "::" in name else (file, name) for name in named}
+        if not named or not where <= fast:
             alone.append(f"{file}::{function}")
     assert alone == []
 

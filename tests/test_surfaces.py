@@ -584,7 +584,7 @@ def test_surfaces_of_names_files_and_bodies(tmp_path):
 # Real meshes -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_exact_at_metre_scale")
 @pytest.mark.realdata
 @pytest.mark.parametrize(
     ("file", "unit"),

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import trimesh
     from matplotlib.figure import Figure
 
-    from .verdict_words import Verdict
+    from .answers import Verdict
 
 __all__ = [
     "bracket_of_the_margin",
@@ -42,16 +42,17 @@ __all__ = [
 ]
 
 BLUE, RED, GREY, YELLOW = "#00798c", "#d1495b", "0.45", "#edae49"
-STYLE: Any = {"figure.dpi": 110, "axes.grid": True, "grid.alpha": 0.3, "font.size": 9}
 
 
 def panels_in_a_row(count: int, size: tuple[float, float], **options: Any) -> tuple[Figure, Any]:
     """A figure with ``count`` panels in a row, in the notebooks' style."""
     import matplotlib.pyplot as plt
 
-    plt.get_backend()  # chosen before the context, which would undo what the choice sets
-    with plt.rc_context(STYLE):
-        return plt.subplots(1, count, figsize=size, layout="constrained", **options)
+    # By hand and not in an ``rc_context``, which would also undo what a notebook's backend sets.
+    figure, axes = plt.subplots(1, count, figsize=size, dpi=110, layout="constrained", **options)
+    for one in np.atleast_1d(axes):
+        one.grid(True, alpha=0.3)
+    return figure, axes
 
 
 # Verdicts ------------------------------------------------------------------------------------------------
@@ -63,7 +64,7 @@ def verdict_of(grasp: Grasp, answer: WrenchResistance, centre_of_mass: Any, forc
     grasp, answer   of one lane, about the centre of mass     centre_of_mass  (3,) m, mesh frame
     force           (k, n) N, drawn instead of the answer's internal force
     """
-    from .verdict_words import Verdict
+    from .answers import Verdict
 
     status = Status(int(answer.status))
     kind = {"Frictionless": "frictionless", "HardFinger": "hard", "SoftFinger": "soft"}[
@@ -79,7 +80,6 @@ def verdict_of(grasp: Grasp, answer: WrenchResistance, centre_of_mass: Any, forc
         "active": np.asarray(grasp.active),
         "status": int(status),
         "margin": float(answer.lower),
-        "gap": float(answer.upper - answer.lower),
         "upper": float(answer.upper),
         "rank": int(answer.rank),
         "internal_force": np.asarray(shown).ravel(),
@@ -90,7 +90,7 @@ def verdict_of(grasp: Grasp, answer: WrenchResistance, centre_of_mass: Any, forc
 
 def grasp_picture(verdict: Verdict, mesh: trimesh.Trimesh | None = None) -> bytes:
     """The PNG of ``draw``: object, contacts, friction cones, forces, or the object moved along its escape."""
-    from . import draw
+    from .drawing import draw
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "grasp.png"
