@@ -40,7 +40,7 @@ def rotation_vectors(dtype):
 def test_the_exponential_and_the_matrix_are_scipys(dtype):
     rng = np.random.default_rng(40)
     v = rotation_vectors(dtype)
-    start = jg.BodyState.at_rest(3, (len(v),), dtype).orientation
+    start = jg.BodyState.at_rest(3, (len(v),), dtype=dtype).orientation
     q = turned(start, jnp.asarray(v))
     wanted = Rotation.from_rotvec(v.astype(float)).as_matrix()
     np.testing.assert_allclose(orientation_matrix(q), wanted, atol=close(dtype))
@@ -72,7 +72,7 @@ def test_the_jacobian_is_the_derivative_of_the_exponential(dtype):
 
 
 def test_rotations_have_derivatives_at_zero(dtype):
-    zero, start = jnp.zeros(3, dtype), jg.BodyState.at_rest(3, (), dtype).orientation
+    zero, start = jnp.zeros(3, dtype), jg.BodyState.at_rest(3, dtype=dtype).orientation
     for function in (
         lambda v: rotation_between(turned(start, v), start),
         lambda v: jacobian_product(v, jnp.ones(3, dtype)),
@@ -135,7 +135,7 @@ def test_the_terms_are_newtons_and_eulers(dtype):
 def test_contact_forces_turn_with_the_body(dtype):
     position = np.array([[0.1, 0, 0], [-0.1, 0, 0], [0, 0.1, 0]], dtype)
     grasp = jg.Grasp(position, -position, jg.HardFinger(jnp.asarray(0.5, dtype)))
-    quarter = turned(jg.BodyState.at_rest(3, (), dtype).orientation, jnp.asarray([0, 0, np.pi / 2], dtype))
+    quarter = turned(jg.BodyState.at_rest(3, dtype=dtype).orientation, jnp.asarray([0, 0, np.pi / 2], dtype))
     G, R = np.asarray(jg.grasp_map(grasp)), np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
     wanted = np.concatenate([R @ G[:3], R @ G[3:]])
     np.testing.assert_allclose(jg.motion.world_grasp_map(grasp, quarter), wanted, atol=close(dtype))
@@ -164,7 +164,7 @@ def test_a_free_body_keeps_momentum_and_nearly_its_energy(dtype):
 def test_falling_is_exact(dtype):
     """v = g t, and semi-implicit Euler's p = g h^2 n (n + 1) / 2."""
     body = jg.RigidBody(jnp.asarray(0.2, dtype), 1e-4 * jnp.eye(3, dtype=dtype))
-    state = jg.BodyState.at_rest(3, (), dtype)
+    state = jg.BodyState.at_rest(3, dtype=dtype)
     for _ in range(10):
         state = jg.motion.advance(body, state, jnp.zeros(6, dtype), timestep=0.01)
     np.testing.assert_allclose(state.velocity, [0, 0, -0.981, 0, 0, 0], atol=1e-6)

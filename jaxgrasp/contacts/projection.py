@@ -80,7 +80,7 @@ class Tile(NamedTuple):
 
     @property
     def coefficients(self) -> tuple[Array, Array]:
-        """mu and gamma (k, L)."""
+        """``mu, gamma`` of the contacts, (k, L)."""
         return to_lanes(self.contacts.friction), to_lanes(self.contacts.torsion)
 
 
@@ -107,6 +107,7 @@ def _applied(columns: Cone, s: Cone) -> Vector:
 
 @stage
 def minus_transposed(columns: Cone, s: Cone, y: Vector) -> Cone:
+    """``s - A^T y`` for the columns of A, contact by contact."""
     return tuple(a - b for a, b in zip(s, rmatvec(columns, y), strict=True))
 
 

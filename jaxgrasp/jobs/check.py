@@ -160,7 +160,7 @@ def _disturbed(
     sides = np.concatenate([np.eye(3), -np.eye(3)])
     push = np.zeros((STEPS, 6, 6))
     push[PUSH[0] : PUSH[1], :, :3] = SHARE * float(body.mass) * np.linalg.norm(gravity) * sides
-    start = BodyState.at_rest(3, (6 * n,), grasp.dtype)
+    start = BodyState.at_rest(3, (6 * n,), dtype=grasp.dtype)
     out: ClosedLoop = close_loop(
         lanes,
         body,

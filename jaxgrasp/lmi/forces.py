@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from ..contacts import Grasp, TorqueLimits, grasp_map, length_scale, null_space
-from ..core import Answer, Array, Float, Int, Status, rank_tolerance, wrench_dimension
+from ..core import Answer, Array, Float, Int, Status, rank_tolerance, real_array, spread, wrench_dimension
 from ..forces import Criterion
 from .barrier import gap_goal, minimize
 from .feasibility import feasibility
@@ -89,27 +89,25 @@ def lmi_forces(
     wrench = _load(grasp, wrench)
     limit = None
     if max_normal is not None:
-        limit = _broadcast(max_normal, (*batch, grasp.contacts), "max_normal", dtype)
+        limit = spread(
+            real_array(max_normal, "max_normal").astype(dtype), (grasp.contacts,), batch, "max_normal"
+        )
     torques = None
     if isinstance(torque_limits, TorqueLimits):
         torque_limits = torque_limits.in_contact_axes(grasp)
     if torque_limits is not None:
         J, largest = torque_limits
-        J = jnp.asarray(J)
+        J = real_array(J, "J of torque_limits")
         if J.ndim < 2:
             raise ValueError(f"J of torque_limits must have shape (*batch, k n, q), got {J.shape}")
         rows = grasp.contacts * grasp.model.force_size(grasp.dimension)
-        J = _broadcast(J, (*batch, rows, J.shape[-1]), "J of torque_limits", dtype)
-        torques = J, _broadcast(largest, (*batch, J.shape[-1]), "tau_max of torque_limits", dtype)
-    criterion = jax.tree.map(lambda leaf: _broadcast(leaf, batch, "the criterion's weight", dtype), criterion)
+        J = spread(J.astype(dtype), (rows, J.shape[-1]), batch, "J of torque_limits")
+        largest = real_array(largest, "tau_max of torque_limits").astype(dtype)
+        torques = J, spread(largest, J.shape[-1:], batch, "tau_max of torque_limits")
+    criterion = jax.tree.map(
+        lambda x: spread(x.astype(dtype), (), batch, "the criterion's weight"), criterion
+    )
     return _solve(grasp, wrench, criterion, limit, torques, tolerance)
-
-
-def _broadcast(value, shape: tuple[int, ...], name: str, dtype) -> Array:
-    try:
-        return jnp.broadcast_to(jnp.asarray(value).astype(dtype), shape)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must broadcast to shape {shape}, got {jnp.shape(value)}") from error
 
 
 def _load(grasp: Grasp, wrench) -> Array:

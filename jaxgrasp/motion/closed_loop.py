@@ -248,7 +248,7 @@ def close_loop(
     batch, dtype, steps = grasp.batch_shape, grasp.dtype, simulation.steps
     body, state = _wide(grasp, body, state, batch)
     if reference is None:
-        reference = Reference.hold(BodyState.at_rest(grasp.dimension, (), dtype))
+        reference = Reference.hold(BodyState.at_rest(grasp.dimension, dtype=dtype))
     reference, moving = _laid_out(reference, batch, steps, dtype)
     pushes = None if disturbance is None else _pushes(grasp, disturbance, steps)
     setting = _Setting(grasp, body, controller, simulation.gravity, simulation.plant)

@@ -134,7 +134,7 @@ class Reference(eqx.Module):
         def point(t: Array) -> Reference:
             pose = path(t)
             d = _dimension(pose)
-            start = BodyState.at_rest(d, (), pose.dtype)
+            start = BodyState.at_rest(d, dtype=pose.dtype)
             rate, change = jax.jvp(velocity, (t,), (one,))
             return cls(pose[:d], turned(start.orientation, pose[d:]), rate, change)
 

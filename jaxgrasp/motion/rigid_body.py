@@ -198,7 +198,9 @@ class BodyState(eqx.Module):
         return self.position.shape[-1]
 
     @classmethod
-    def at_rest(cls, dimension: int = 3, batch: tuple[int, ...] = (), dtype: DTypeLike = float) -> BodyState:
+    def at_rest(
+        cls, dimension: int = 3, batch: tuple[int, ...] = (), *, dtype: DTypeLike = float
+    ) -> BodyState:
         """At the origin, not turned, not moving: the equilibrium configuration of the chapter."""
         dtype = jnp.result_type(dtype)
         turn = identity_orientation(dimension, dtype)

@@ -103,7 +103,7 @@ class Margin(Objective):
 class Measure(Objective):
     """``function(grasp)``: any differentiable function of a ``Grasp`` with batch shape (B,) to (B,)."""
 
-    function: Callable[[Grasp], Array] = eqx.field(static=True)
+    function: Callable[[Grasp], Float[Array, " B"]] = eqx.field(static=True)
 
     def value(self, grasp: Grasp, memory: Memory) -> Float[Array, " B"]:
         """``function(grasp)``."""

@@ -105,7 +105,7 @@ class Within(Requirement):
     inside  maps a point (3,) in m, in the surface's frame, to a signed distance in m: positive where contacts may be
     """
 
-    inside: Callable[[Array], Array] = eqx.field(static=True)
+    inside: Callable[[Float[Array, " 3"]], Float[Array, ""]] = eqx.field(static=True)
 
     def excess(
         self, surface: SmoothSurface, position: Float[Array, "*batch k 3"], normal: Float[Array, "*batch k 3"]

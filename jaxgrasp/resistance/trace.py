@@ -53,10 +53,14 @@ def _tile(contacts: Contacts, components: tuple[Component, ...]):
     return folded, projection, margin_program(projection.basis)
 
 
-def trace(grasp: Grasp, tolerance: float = 1e-8, max_iterations: int = TOTAL_BUDGET) -> Trace:
-    """The margin problem of one grasp, iteration by iteration: bracket, residuals, step lengths.
+def trace(grasp: Grasp, *, tolerance: float = 1e-8, max_iterations: int = TOTAL_BUDGET) -> Trace:
+    """``lower <= t* <= upper`` after each iteration of the solver, for one grasp; residuals and step lengths beside it.
 
-    ``grasp`` must be a single grasp (no batch axes): index a batch first, ``trace(grasps[17])``.
+    grasp           a single grasp (no batch axes): index a batch first, ``trace(grasps[17])``
+    tolerance       duality gap to reach, relative to the margin
+    max_iterations  at most
+
+    Returns a ``Trace``; ``print`` it. ValueError where the grasp has batch axes.
     """
     if grasp.batch_shape:
         raise ValueError(
