@@ -44,7 +44,8 @@ import jaxgrasp as jg
 from jaxgrasp import objects, surfaces
 from jaxgrasp.contacts.models import ContactModel
 from jaxgrasp.placement.objectives import Epsilon, Margin, lessons
-from jaxgrasp.placement.place import CANDIDATES, Placement, place_contacts
+from jaxgrasp.placement.place import Placement, place_contacts
+from jaxgrasp.placement.search import CANDIDATES, Search
 from jaxgrasp.placement.settle import ROUNDS, TRIALS
 from jaxgrasp.quality.unit_wrench_space import effort_map, torque_lengths
 from jaxgrasp.surfaces.mesh import MeshSurface
@@ -72,7 +73,7 @@ def real_meshes() -> list[str]:
 
 def surface_of(name: str) -> MeshSurface:
     source, _, unit = name.partition(":")
-    return surfaces.of(source, unit or "m")
+    return surfaces.of(source, unit=unit or "m")
 
 
 class Problem(NamedTuple):
@@ -173,7 +174,13 @@ def row(name: str, problem: Problem, starts: int, simplexes: int) -> dict[str, A
     objective = Epsilon("L1", problem.radius)
 
     def place() -> Placement:
-        return place_contacts(problem.surface, problem.fingers, problem.model, objective, starts, seed=1)
+        return place_contacts(
+            problem.surface,
+            fingers=problem.fingers,
+            model=problem.model,
+            objective=objective,
+            search=Search(starts, seed=1),
+        )
 
     place()  # compiles
     begin = time.perf_counter()
@@ -244,10 +251,12 @@ def costs() -> list[dict[str, Any]]:
         problem = Problem(surface, fingers, model)
         for objective in (Margin(), Epsilon("L1", problem.radius), Epsilon("Linf", problem.radius)):
             first = time.perf_counter()
-            place_contacts(surface, fingers, model, objective, 64)
+            place_contacts(surface, fingers=fingers, model=model, objective=objective, search=Search(64))
             first = time.perf_counter() - first
             begin = time.perf_counter()
-            out = place_contacts(surface, fingers, model, objective, 256)
+            out = place_contacts(
+                surface, fingers=fingers, model=model, objective=objective, search=Search(256)
+            )
             seconds = time.perf_counter() - begin
             name = f"{type(objective).__name__} {getattr(objective, 'norm', '')}".strip()
             rows.append({

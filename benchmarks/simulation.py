@@ -93,7 +93,7 @@ def closed_loop(
     push = np.zeros((steps, n, 6))
     push[10:35, :, :3] = 0.5 * np.asarray(body.mass)[:, None] * 9.81 * np.array([0.6, 0.8, 0.0])
     start = jg.BodyState.at_rest(3, (n,))
-    controller = jg.ComputedTorque(jg.Gains.of_rate(RATE), criterion)
+    controller = jg.ComputedTorque(jg.Gains.of_rate(RATE), criterion=criterion)
     plant = jg.motion.mujoco_plant(body, timestep=H) if mujoco else None
 
     def run():
@@ -102,10 +102,8 @@ def closed_loop(
             body,
             controller=controller,
             state=start,
-            steps=steps,
-            timestep=H,
+            simulation=jg.motion.Simulation(steps, timestep=H, plant=plant),
             disturbance=jnp.asarray(push),
-            plant=plant,
         )
 
     first, times, out = clocked(run, repeats)

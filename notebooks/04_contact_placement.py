@@ -17,29 +17,28 @@
 # # Moving contacts until the grasp is good
 #
 # A random grasp of an object seldom holds. The margin of wrench resistance has a gradient with respect to the
-# contacts, even where the grasp does not hold: following it over the surface makes a grasp better. This notebook
-# does that for three fingers on an ellipsoid, draws their way, and says how good the grasp became.
+# contacts, even where the grasp does not hold: following it over the surface makes a grasp better. This notebook does
+# that for three fingers on an ellipsoid, draws their way, and says how good the grasp became.
 #
 # Lengths are in m.
 
 # %%
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 
 import jaxgrasp as jg
 from jaxgrasp import surfaces
-from jaxgrasp.placement.place import place_contacts
-from jaxgrasp.placement.requirements import Apart
+from jaxgrasp.placement import Apart, Search, place_contacts
+from jaxgrasp.report import plots
 
 jax.config.update("jax_enable_x64", True)  # without it JAX computes in float32
 
 # %% [markdown]
 # ## The surface
 #
-# An ellipsoid; `surfaces.of("mug")` or a mesh file would do as well. `contact` gives the nearest point of the
-# surface and the inward normal there; both are differentiable.
+# An ellipsoid; `surfaces.of("mug")` or a mesh file would do as well. `contact` gives the nearest point of the surface
+# and the inward normal there; both are differentiable.
 
 # %%
 surface = surfaces.Ellipsoid(jnp.array([0.03, 0.04, 0.06]))
@@ -77,14 +76,7 @@ for _ in range(40):
     ways.append(step(ways[-1]))
 ways = np.asarray(jnp.stack(ways))  # (41, 12, 3, 3)
 margins = np.stack([np.asarray(jg.wrench_resistance(grasp_at(jnp.asarray(w))).margin) for w in ways[::5]])
-
-figure, axes = plt.subplots(figsize=(6, 3.5))
-axes.plot(np.arange(0, 41, 5), np.maximum(margins, -1.5))
-axes.axhline(0, color="black", linewidth=0.8)
-axes.set_xlabel("step")
-axes.set_ylabel("margin t* (resistant above 0)")
-axes.set_title("Twelve random starts, three hard fingers, mu = 0.4")
-figure.tight_layout()
+figure = plots.climb(np.arange(0, 41, 5), margins)
 assert (margins[-1] > 0).mean() > (margins[0] > 0).mean()
 
 # %% [markdown]
@@ -92,32 +84,19 @@ assert (margins[-1] > 0).mean() > (margins[0] > 0).mean()
 
 # %%
 gain = np.argmax(margins[-1] - np.maximum(margins[0], -1.5))
-turn, height = np.meshgrid(np.linspace(0, 2 * np.pi, 40), np.linspace(0, np.pi, 20))
-body = [np.sin(height) * np.cos(turn), np.sin(height) * np.sin(turn), np.cos(height)]
-figure = plt.figure(figsize=(6, 6))
-axes = figure.add_subplot(projection="3d")
-axes.plot_surface(
-    *(a * x for a, x in zip((0.03, 0.04, 0.06), body, strict=True)), alpha=0.2, color="steelblue"
-)
-for finger in range(3):
-    way = ways[:, gain, finger]
-    axes.plot(*way.T, linewidth=2.5)
-    axes.scatter(*way[0], s=60, facecolors="none", edgecolors="black")
-    axes.scatter(*way[-1], s=60, color="black")
-axes.set_box_aspect([0.03, 0.04, 0.06])
-axes.set_title(f"margin {margins[0, gain]:.2f} -> {margins[-1, gain]:.2f}")
-for side in (axes.xaxis, axes.yaxis, axes.zaxis):
-    side.set_major_locator(plt.MaxNLocator(4))
-figure.tight_layout()
+print(f"margin {margins[0, gain]:.2f} -> {margins[-1, gain]:.2f}")
+figure = plots.way_on_an_ellipsoid((0.03, 0.04, 0.06), ways[:, gain])
 
 # %% [markdown]
 # ## Many starts at once
 #
-# `place_contacts` does the same with an optimiser from optax, requirements, early stops, and returns the best distinct
-# grasps, each solved again and proved by the independent checker.
+# `place_contacts` does the same with an optimiser from optax, requirements, early stops, and returns the best
+# distinct grasps, each solved again and proved by the independent checker.
 
 # %%
-placed = place_contacts(surface, fingers=3, model=model, starts=64, steps=100, requirements=[Apart(0.02)])
+placed = place_contacts(
+    surface, fingers=3, model=model, requirements=[Apart(0.02)], search=Search(64, steps=100)
+)
 print(
     f"resistant: {np.mean(placed.before > 0):.0%} of the starts, {np.mean(placed.resistant):.0%} of the ends"
 )

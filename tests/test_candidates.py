@@ -26,7 +26,7 @@ def on_faces(mesh, points, normals):
 @pytest.mark.parametrize("name", ["mug", "box"])
 def test_points_lie_on_the_surface_with_inward_normals(name):
     mesh = objects.make_object(name)
-    position, normal = SurfaceSampler(mesh, 3, seed=1).rows(0, 100)
+    position, normal = SurfaceSampler(mesh, fingers=3, seed=1).rows(0, 100)
     assert position.shape == normal.shape == (100, 3, 3)
     assert on_faces(mesh, position.reshape(-1, 3), normal.reshape(-1, 3)).max() < 1e-12
     assert np.linalg.norm(normal, axis=-1) == pytest.approx(1, abs=1e-12)
@@ -34,7 +34,7 @@ def test_points_lie_on_the_surface_with_inward_normals(name):
 
 def test_uniform_over_the_area():
     mesh = objects.make_object("box")
-    position, normal = SurfaceSampler(mesh, 1, seed=0).rows(0, 60_000)
+    position, normal = SurfaceSampler(mesh, fingers=1, seed=0).rows(0, 60_000)
     areas = {0: 0.08 * 0.06, 1: 0.12 * 0.06, 2: 0.12 * 0.08}
     for axis, area in areas.items():
         for sign in (-1, 1):
@@ -48,12 +48,13 @@ def test_uniform_over_the_area():
 
 
 def test_any_range_in_any_order_gives_the_same_rows(mug):
-    for sampler in (SurfaceSampler(mug, 3, seed=7), AntipodalSampler(mug, 0.5, seed=7)):
+    for sampler in (SurfaceSampler(mug, fingers=3, seed=7), AntipodalSampler(mug, friction=0.5, seed=7)):
         position, normal = sampler.rows(0, 2 * BLOCK + 10)
         low, high = BLOCK - 5, BLOCK + 6
         p, n = sampler.rows(low, high)
         assert np.array_equal(p, position[low:high]) and np.array_equal(n, normal[low:high])
-        other, _ = type(sampler)(mug, 3 if sampler.fingers == 3 else 0.5, seed=8).rows(0, 10)
+        option = {"fingers": 3} if sampler.fingers == 3 else {"friction": 0.5}
+        other, _ = type(sampler)(mug, **option, seed=8).rows(0, 10)
         assert not np.isclose(other, position[:10]).any()
         assert len(np.unique(position.reshape(-1, 3), axis=0)) == position.size // 3  # blocks do not repeat
 
@@ -61,7 +62,7 @@ def test_any_range_in_any_order_gives_the_same_rows(mug):
 def test_the_guide_table_is_the_search(mug):
     uneven = trimesh.Trimesh(mug.vertices * (1.0, 1e-4, 1.0), mug.faces, process=False)
     for mesh in (mug, uneven):
-        sampler = SurfaceSampler(mesh, 1, seed=0)
+        sampler = SurfaceSampler(mesh, fingers=1, seed=0)
         u = np.random.default_rng(0).random(20_000)
         u[:3] = 0.0, np.nextafter(1.0, 0.0), sampler.cumulative[10]
         assert np.array_equal(sampler.choose(u), np.searchsorted(sampler.cumulative, u, side="right"))
@@ -70,23 +71,23 @@ def test_the_guide_table_is_the_search(mug):
 def test_degenerate_faces_are_never_chosen():
     vertices, faces = builtin.box()
     mesh = trimesh.Trimesh(vertices, np.concatenate([[[0, 0, 1]], faces, [[2, 2, 2]]]), process=False)
-    position, normal = SurfaceSampler(mesh, 2, seed=0).rows(0, BLOCK)
+    position, normal = SurfaceSampler(mesh, fingers=2, seed=0).rows(0, BLOCK)
     assert np.isfinite(position).all()
     assert np.linalg.norm(normal, axis=-1) == pytest.approx(1, abs=1e-12)
     with pytest.raises(UserError, match="zero area"):
-        SurfaceSampler(trimesh.Trimesh(vertices, [[0, 0, 1]], process=False), 2, seed=0)
+        SurfaceSampler(trimesh.Trimesh(vertices, [[0, 0, 1]], process=False), fingers=2, seed=0)
 
 
 def test_no_fingers_and_negative_seeds_are_refused(mug):
     with pytest.raises(UserError, match="at least one finger"):
-        SurfaceSampler(mug, 0, seed=0)
+        SurfaceSampler(mug, fingers=0, seed=0)
     with pytest.raises(UserError, match="seed"):
-        SurfaceSampler(mug, 1, seed=-1)
+        SurfaceSampler(mug, fingers=1, seed=-1)
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.5])
 def test_antipodal_pairs(mug, friction):
-    position, normal = AntipodalSampler(mug, friction, seed=2).rows(0, 300)
+    position, normal = AntipodalSampler(mug, friction=friction, seed=2).rows(0, 300)
     line = position[:, 1] - position[:, 0]
     length = np.linalg.norm(line, axis=1)
     cosine = np.einsum("ij,ij->i", line, normal[:, 0]) / length
@@ -101,7 +102,7 @@ def test_antipodal_pairs(mug, friction):
 
 
 def test_antipodal_pairs_of_a_box_are_across_it():
-    position, normal = AntipodalSampler(objects.make_object("box"), 0.0, seed=0).rows(0, 500)
+    position, normal = AntipodalSampler(objects.make_object("box"), friction=0.0, seed=0).rows(0, 500)
     line = position[:, 1] - position[:, 0]
     axis = np.argmax(np.abs(line), axis=1)
     assert np.linalg.norm(line, axis=1) == pytest.approx(np.array([0.12, 0.08, 0.06])[axis], abs=1e-12)
@@ -111,7 +112,7 @@ def test_antipodal_pairs_of_a_box_are_across_it():
 def test_an_open_sheet_has_no_antipodal_pairs():
     sheet = trimesh.Trimesh([(0, 0, 0), (0.1, 0, 0), (0, 0.1, 0)], [(0, 1, 2)], process=False)
     with pytest.raises(UserError, match="--sampler surface"):
-        AntipodalSampler(sheet, 0.5, seed=0).rows(0, 10)
+        AntipodalSampler(sheet, friction=0.5, seed=0).rows(0, 10)
 
 
 @pytest.mark.parametrize("name", ["mug", "box", "torus"])
@@ -154,11 +155,13 @@ def test_the_filter_only_drops_what_a_slide_refutes():
 def test_the_filter_says_why():
     position = np.array([[[0, 0, 0], [0, 0, 5e-4]], [[0, 0, 0], [0, 0, 1.0]], [[0, 0, 0], [0, 0, 5e-4]]])
     normal = np.array([[[0, 0, 1], [0, 0, -1]], [[0, 0, 1], [0, 0, 1]], [[0, 0, 1], [0, 0, 1.0]]])
-    slide, close = geometric_filter(position, normal, np.full((3, 2), 0.5), np.ones((3, 2), bool)).values()
+    slide, close = geometric_filter(
+        position, normal, friction=np.full((3, 2), 0.5), active=np.ones((3, 2), bool)
+    ).values()
     assert slide.tolist() == [False, True, True] and close.tolist() == [True, False, False]
 
 
 def test_a_body_from_a_file_can_be_sampled(tmp_path, mug):
     mug.export(tmp_path / "mug.ply")
-    position, _ = SurfaceSampler(objects.load_mesh(tmp_path / "mug.ply").mesh, 2, seed=0).rows(0, 10)
+    position, _ = SurfaceSampler(objects.load_mesh(tmp_path / "mug.ply").mesh, fingers=2, seed=0).rows(0, 10)
     assert np.isfinite(position).all()

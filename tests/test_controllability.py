@@ -214,7 +214,7 @@ def test_A_and_B_are_the_derivatives_of_the_motion(dimension):
     def motion(x, f):
         state = jg.BodyState.at_rest(dimension).displaced(x[:m], x[m:])
         wrench = jg.motion.world_grasp_map(grasp, state.orientation) @ f
-        return jnp.concatenate([state.velocity, jg.motion.acceleration(body, state, wrench, gravity)])
+        return jnp.concatenate([state.velocity, jg.motion.acceleration(body, state, wrench, gravity=gravity)])
 
     A, B = jax.jacfwd(motion, argnums=(0, 1))(jnp.zeros(2 * m), jnp.asarray(force))
     from jaxgrasp.motion.linearization import _blocks
@@ -377,7 +377,9 @@ def test_the_gramian_is_its_integral():
         w / 2 * 1.5 * (E := expm(A * 1.5 * (x + 1) / 2)) @ B @ B.T @ E.T
         for x, w in zip(nodes, weights, strict=True)
     )
-    np.testing.assert_allclose(jg.motion.gramian(jnp.asarray(A), jnp.asarray(B), 1.5), wanted, atol=1e-12)
+    np.testing.assert_allclose(
+        jg.motion.gramian(jnp.asarray(A), jnp.asarray(B), horizon=1.5), wanted, atol=1e-12
+    )
 
 
 def test_the_weakest_direction_costs_its_effort(answers):

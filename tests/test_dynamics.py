@@ -128,7 +128,7 @@ def test_the_terms_are_newtons_and_eulers(dtype):
         M[:, :3, :3], np.asarray(body.mass)[:, None, None] * np.eye(3), atol=close(dtype)
     )
     np.testing.assert_allclose(M[:, :3, 3:], 0)
-    weight = jg.motion.gravity_term(body, (0.0, 0.0, -10.0))
+    weight = jg.motion.gravity_term(body, gravity=(0.0, 0.0, -10.0))
     np.testing.assert_allclose(weight[:, 2], 10 * np.asarray(body.mass), rtol=1e-6)
 
 
@@ -152,7 +152,7 @@ def test_a_free_body_keeps_momentum_and_nearly_its_energy(dtype):
         return jnp.einsum("nij,nj->ni", jg.motion.mass_matrix(body, s.orientation), s.velocity)
 
     def step(_, s):
-        return jg.motion.advance(body, s, none, h, gravity=(0.0, 0.0, 0.0))
+        return jg.motion.advance(body, s, none, timestep=h, gravity=(0.0, 0.0, 0.0))
 
     after = jax.jit(lambda s: jax.lax.fori_loop(0, 1000, step, s))(state)
     scale = np.abs(momentum(state)).max()
@@ -166,7 +166,7 @@ def test_falling_is_exact(dtype):
     body = jg.RigidBody(jnp.asarray(0.2, dtype), 1e-4 * jnp.eye(3, dtype=dtype))
     state = jg.BodyState.at_rest(3, (), dtype)
     for _ in range(10):
-        state = jg.motion.advance(body, state, jnp.zeros(6, dtype), 0.01)
+        state = jg.motion.advance(body, state, jnp.zeros(6, dtype), timestep=0.01)
     np.testing.assert_allclose(state.velocity, [0, 0, -0.981, 0, 0, 0], atol=1e-6)
     np.testing.assert_allclose(state.position, [0, 0, -9.81 * 0.01**2 * 55], atol=1e-6)
 
@@ -263,7 +263,7 @@ def test_wrong_meshes_raise():
 def test_gravity_must_be_a_vector(dtype):
     body = jg.RigidBody(1.0, np.eye(3))
     with pytest.raises(ValueError, match="gravity must be a vector of 3"):
-        jg.motion.gravity_term(body, (0.0, -9.81))
+        jg.motion.gravity_term(body, gravity=(0.0, -9.81))
 
 
 def test_rotating_everything_rotates_the_answer(dtype):
@@ -281,8 +281,8 @@ def test_rotating_everything_rotates_the_answer(dtype):
         quaternion_product(jnp.broadcast_to(jnp.asarray(q), (3, 4)), state.orientation),
         state.velocity @ both.T,
     )
-    first = jg.motion.acceleration(body, state, jnp.asarray(wrench), g)
+    first = jg.motion.acceleration(body, state, jnp.asarray(wrench), gravity=g)
     second = jg.motion.acceleration(
-        body, moved, jnp.asarray(wrench @ both.T), jnp.asarray(turn.astype(dtype) @ g)
+        body, moved, jnp.asarray(wrench @ both.T), gravity=jnp.asarray(turn.astype(dtype) @ g)
     )
     np.testing.assert_allclose(second, first @ both.T, atol=50 * close(dtype))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxgrasp as jg
+from jaxgrasp import Status
 from jaxgrasp.lmi.feasibility import lmi_feasibility, second_order_cone_lmi
 from jaxgrasp.lmi.friction import friction_lmi, lmi_margin
 
@@ -156,7 +157,7 @@ def test_erratum_1_the_lmi_test_must_be_strict_and_normalised(dtype):
             np.linalg.eigvalsh(scale * np.einsum("j,jab->ab", z, reduced))[0] for scale in (1, 10, 100)
         ]
         feasible = lmi_feasibility(lmi.constant, jnp.asarray(reduced))
-        assert bool(feasible.feasible) == (name == "holds")
+        assert (feasible.status == Status.FEASIBLE) == (name == "holds")
     # eta(z) = -lambda_min scales with z: unbounded below where the grasp holds.
     np.testing.assert_allclose(smallest["holds"], 0.3 * np.array([1, 10, 100]), rtol=1e-4)
     assert max(smallest["falls"]) <= 1e-6

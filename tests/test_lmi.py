@@ -7,6 +7,7 @@ import pytest
 from clarabel_oracle import clarabel_margin
 
 import jaxgrasp as jg
+from jaxgrasp import Status
 from jaxgrasp.lmi.barrier import lmi_minimize
 from jaxgrasp.lmi.feasibility import lmi_feasibility, second_order_cone_lmi
 from jaxgrasp.lmi.friction import friction_lmi, lmi_margin, margin_lmi
@@ -151,10 +152,10 @@ def test_linear_program_as_diagonal_lmi(dtype):
     rows = np.array([[1, 0], [0, 1], [-1, -1], [0, -1]])
     matrices = [np.diag(rows[:, i]) for i in range(2)]
     solution = lmi_minimize(problem([-1, -2], np.diag([0, 0, 3, 2]), matrices, [0.5, 0.5], dtype))
-    assert bool(solution.converged)
+    assert solution.status == Status.OPTIMAL
     np.testing.assert_allclose(solution.x, [1, 2], atol=4 * solved_to(dtype))
-    np.testing.assert_allclose(solution.value, -5, rtol=solved_to(dtype))
-    assert float(solution.bound) <= -5 + solved_to(dtype) <= float(solution.value) + 2 * solved_to(dtype)
+    np.testing.assert_allclose(solution.upper, -5, rtol=solved_to(dtype))
+    assert float(solution.lower) <= -5 + solved_to(dtype) <= float(solution.upper) + 2 * solved_to(dtype)
 
 
 def test_largest_eigenvalue_as_lmi(dtype):
@@ -163,16 +164,16 @@ def test_largest_eigenvalue_as_lmi(dtype):
     M = M + np.swapaxes(M, -1, -2)
     batch = problem([[1.0]] * 5, -M, np.broadcast_to(np.eye(4), (5, 1, 4, 4)), [[20.0]] * 5, dtype)
     solution = lmi_minimize(batch)
-    assert bool(solution.converged.all())
+    assert bool((solution.status == Status.OPTIMAL).all())
     largest = np.linalg.eigvalsh(M)[:, -1]
-    np.testing.assert_allclose(solution.value, largest, rtol=solved_to(dtype))
-    assert np.all(np.asarray(solution.bound) <= largest * (1 + solved_to(dtype)))
+    np.testing.assert_allclose(solution.upper, largest, rtol=solved_to(dtype))
+    assert np.all(np.asarray(solution.lower) <= largest * (1 + solved_to(dtype)))
     for i in range(5):
         one = lmi_minimize(jax.tree.map(lambda leaf, i=i: leaf[i], batch))
-        np.testing.assert_allclose(one.value, solution.value[i], rtol=solved_to(dtype))
+        np.testing.assert_allclose(one.upper, solution.upper[i], rtol=solved_to(dtype))
     again = jax.jit(jax.vmap(lmi_minimize))(batch)
-    np.testing.assert_allclose(again.value, solution.value, rtol=solved_to(dtype))
-    assert again.value.dtype == jnp.dtype(dtype)
+    np.testing.assert_allclose(again.upper, solution.upper, rtol=solved_to(dtype))
+    assert again.upper.dtype == jnp.dtype(dtype)
 
 
 def test_the_gap_is_a_proof_at_every_tolerance(dtype):
@@ -183,9 +184,9 @@ def test_the_gap_is_a_proof_at_every_tolerance(dtype):
     steps = []
     for goal in (1.0, 1e-1, 1e-2):
         solution = lmi_minimize(loose, tolerance=goal)
-        assert bool(solution.converged)
-        assert float(solution.bound) <= optimum + 1e-6 <= float(solution.value) + 2e-6
-        assert float(solution.gap) <= goal * max(1.0, abs(float(solution.value)))
+        assert solution.status == Status.OPTIMAL
+        assert float(solution.lower) <= optimum + 1e-6 <= float(solution.upper) + 2e-6
+        assert float(solution.gap) <= goal * max(1.0, abs(float(solution.upper)))
         steps.append(int(solution.iterations))
     assert steps[0] < steps[-1]
 
@@ -195,30 +196,30 @@ def test_dependent_and_absent_variables_are_harmless(dtype):
     eye, M = np.eye(2), np.diag([1.0, -4.0])
     doubled = problem([1.0, 1.0, 0.0], -M, [eye, eye, 0 * eye], [5.0, 5.0, 7.0], dtype)
     solution = lmi_minimize(doubled)
-    assert bool(solution.converged)
-    np.testing.assert_allclose(solution.value, 1.0, rtol=solved_to(dtype))
+    assert solution.status == Status.OPTIMAL
+    np.testing.assert_allclose(solution.upper, 1.0, rtol=solved_to(dtype))
     assert float(solution.x[2]) == 7.0
 
 
 def test_bad_starts_unbounded_problems_and_few_steps_are_reported(dtype):
     infeasible_start = lmi_minimize(problem([1.0], -np.eye(2), [np.eye(2)], [0.5], dtype))
-    assert np.isnan(infeasible_start.value)
-    assert not bool(infeasible_start.converged)
+    assert np.isnan(infeasible_start.upper)
+    assert infeasible_start.status == Status.INVALID
     unbounded = lmi_minimize(problem([-1.0], np.eye(2), [np.eye(2)], [0.0], dtype))
-    assert not bool(unbounded.converged)
+    assert unbounded.status == Status.STALLED
     assert float(unbounded.gap) == np.inf
     short = lmi_minimize(problem([1.0], -np.eye(2), [np.eye(2)], [20.0], dtype), tolerance=1e-8, max_steps=3)
     assert int(short.iterations) == 3
-    assert not bool(short.converged)
-    assert 1.0 <= float(short.value) < 20.0
+    assert short.status == Status.STALLED
+    assert 1.0 <= float(short.upper) < 20.0
 
 
 def test_a_bad_lane_harms_no_other(dtype):
     M = np.array([np.diag([1.0, 2.0]), np.full((2, 2), np.nan), np.diag([5.0, -1.0])])
     batch = problem([[1.0]] * 3, -M, np.broadcast_to(np.eye(2), (3, 1, 2, 2)), [[9.0]] * 3, dtype)
     solution = lmi_minimize(batch)
-    np.testing.assert_array_equal(solution.converged, [True, False, True])
-    np.testing.assert_allclose(solution.value, [2.0, np.nan, 5.0], rtol=solved_to(dtype))
+    np.testing.assert_array_equal(solution.status, [Status.OPTIMAL, Status.INVALID, Status.OPTIMAL])
+    np.testing.assert_allclose(solution.upper, [2.0, np.nan, 5.0], rtol=solved_to(dtype))
 
 
 def test_lmi_minimize_names_wrong_shapes():
@@ -233,10 +234,10 @@ def test_feasibility_finds_a_point_or_shows_there_is_none(dtype):
     constant = jnp.asarray([np.diag([-a, b]) for a, b in ((10.0, 11.0), (2.0, 1.0), (1.0, 1.0))], dtype)
     matrices = jnp.broadcast_to(jnp.asarray(np.diag([1.0, -1.0]), dtype), (3, 1, 2, 2))
     answer = lmi_feasibility(constant, matrices)
-    np.testing.assert_array_equal(answer.feasible, [True, False, False])
+    np.testing.assert_array_equal(answer.status == Status.FEASIBLE, [True, False, False])
     assert 10.0 < float(answer.x[0, 0]) < 11.0
-    assert float(answer.depth[0]) > 0.01
-    np.testing.assert_allclose(np.asarray(answer.depth + answer.gap)[1:], 0.0, atol=solved_to(dtype))
+    assert float(answer.lower[0]) > 0.01
+    np.testing.assert_allclose(np.asarray(answer.upper)[1:], 0.0, atol=solved_to(dtype))
 
 
 # The margin by this road -------------------------------------------------------------------------------

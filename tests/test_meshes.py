@@ -42,7 +42,7 @@ def test_a_file(box_file):
 
 @pytest.mark.parametrize(("unit", "scale"), [("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("in", 0.0254)])
 def test_units_scale_the_mesh_and_the_centre(box_file, unit, scale):
-    body = objects.load_mesh(box_file, unit)
+    body = objects.load_mesh(box_file, unit=unit)
     assert body.mesh.extents == pytest.approx(scale * np.array([0.1, 0.2, 0.3]), rel=1e-6)
     assert body.centre_of_mass == pytest.approx(scale * np.array([1.0, 2.0, 3.0]), rel=1e-6)
 
@@ -95,7 +95,7 @@ def test_given_centre_of_mass_wins(box_file):
 def test_suspect_units_warn_with_the_extents(tmp_path, unit):
     path = tmp_path / "part.stl"
     trimesh.creation.box(extents=(20, 30, 40) if unit == "m" else (0.2, 0.3, 0.4)).export(path)
-    (warning,) = objects.load_mesh(path, unit).warnings
+    (warning,) = objects.load_mesh(path, unit=unit).warnings
     assert "--unit" in warning
     assert ("20 x 30 x 40" if unit == "m" else "0.0002 x 0.0003 x 0.0004") in warning
 
@@ -166,9 +166,9 @@ def test_bad_files_get_one_clear_line(tmp_path, name, make, message):
 
 def test_a_unit_for_a_built_in_object_is_refused():
     with pytest.raises(UserError, match="in metres"):
-        objects.load_mesh("mug", "mm")
+        objects.load_mesh("mug", unit="mm")
     with pytest.raises(UserError, match="unknown unit"):
-        objects.load_mesh("mug", "furlong")
+        objects.load_mesh("mug", unit="furlong")
 
 
 def test_degenerate_faces_do_not_matter(tmp_path):

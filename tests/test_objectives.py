@@ -120,7 +120,7 @@ def test_what_may_be_an_objective():
         objective(len).guide(), Margin
     )
     for wrong in (3, "margin", Margin):
-        with pytest.raises(ValueError, match=r"objective must be a jaxgrasp\.objectives\.Objective"):
+        with pytest.raises(ValueError, match=r"objective must be a jaxgrasp\.placement\.Objective"):
             objective(wrong)
     with pytest.raises(ValueError, match="norm must be one of L1, Linf"):
         Epsilon("L2")

@@ -10,6 +10,7 @@ from jaxgrasp.core.errors import UserError
 from jaxgrasp.placement import place as placement
 from jaxgrasp.placement.objectives import Epsilon, EpsilonFloor
 from jaxgrasp.placement.requirements import SLACK, Apart, Beyond, EdgeClearance, JawWidth, Requirement, Within
+from jaxgrasp.placement.search import Search
 
 
 class NotNumbers(Requirement):
@@ -27,7 +28,7 @@ ASKED = (Apart(0.03), Beyond((0.1, 0.0, -0.15), 0.03))
 def placed():
     seen = []
     out = placement.place_contacts(
-        BALL, fingers=3, starts=24, steps=120, requirements=ASKED, progress=seen.append
+        BALL, fingers=3, requirements=ASKED, search=Search(24, steps=120), progress=seen.append
     )
     return out, seen
 
@@ -43,6 +44,10 @@ def test_three_fingers_climb_to_the_equator_of_a_ball(placed):
     normal = np.asarray(out.grasp.normal[0])
     cosines = [normal[i] @ normal[j] for i, j in ((0, 1), (0, 2), (1, 2))]
     np.testing.assert_allclose(cosines, -0.5, atol=0.1)
+    assert str(out).startswith(
+        f"{len(out.value)} distinct grasps of 3 contacts from 24 starts; 24 starts ended"
+    )
+    assert f"value {out.value[0]:.6g}, start {out.start[0]}, RESISTANT, proved" in str(out)
     assert seen[-1].done == 24
     assert seen[-1].best == pytest.approx(out.after.max(), rel=0.02)
 
@@ -65,7 +70,7 @@ def test_every_grasp_returned_is_proved_and_within_what_was_asked(placed):
 
 def test_the_same_seed_gives_the_same_bytes(placed):
     out, _ = placed
-    again = placement.place_contacts(BALL, fingers=3, starts=24, steps=120, requirements=ASKED)
+    again = placement.place_contacts(BALL, fingers=3, requirements=ASKED, search=Search(24, steps=120))
     assert out.position.tobytes() == again.position.tobytes()
     assert out.after.tobytes() == again.after.tobytes()
 
@@ -94,16 +99,20 @@ def test_mistakes_are_answered(monkeypatch):
         placement.place_contacts("mug")
     with pytest.raises(ValueError, match="fingers must be an integer of 1 or more"):
         placement.place_contacts(BALL, fingers=0)
-    with pytest.raises(ValueError, match=r"requirements must be jaxgrasp\.requirements"):
+    with pytest.raises(ValueError, match="starts must be an integer of 1 or more"):
+        Search(0)
+    with pytest.raises(ValueError, match="settling must be an integer of 0 or more"):
+        Search(settling=-1)
+    with pytest.raises(ValueError, match=r"requirements must be those of jaxgrasp\.placement"):
         placement.place_contacts(BALL, requirements=[0.02])
     monkeypatch.setattr(placement, "DRAWS", 4)  # of the many after which it gives up
     with pytest.raises(UserError, match="no contact on this surface meets the requirements"):
-        placement.place_contacts(BALL, starts=4, requirements=[Within(lambda p: p[0] - 5.0)])
+        placement.place_contacts(BALL, search=Search(4), requirements=[Within(lambda p: p[0] - 5.0)])
 
 
 @pytest.mark.slow("test_settling.py::test_no_number_is_no_improvement")
 def test_a_start_without_numbers_ends_alone():
-    out = placement.place_contacts(BALL, fingers=3, starts=24, steps=60, requirements=(NotNumbers(),))
+    out = placement.place_contacts(BALL, fingers=3, requirements=(NotNumbers(),), search=Search(24, steps=60))
     assert len(out.value) > 0
     assert np.isfinite(out.value).all()
     assert (out.position[:, 0, 2] <= 0).all()
@@ -111,7 +120,7 @@ def test_a_start_without_numbers_ends_alone():
 
 def test_a_start_does_not_depend_on_how_many_there_are(placed):
     out, _ = placed
-    fewer = placement.place_contacts(BALL, fingers=3, starts=10, steps=120, requirements=ASKED)
+    fewer = placement.place_contacts(BALL, fingers=3, requirements=ASKED, search=Search(10, steps=120))
     assert fewer.before.tobytes() == out.before[:10].tobytes()
     assert fewer.end.tobytes() == out.end[:10].tobytes()
 
@@ -123,9 +132,9 @@ def test_a_start_does_not_depend_on_how_many_there_are(placed):
 def test_epsilon_as_the_objective_on_an_ellipsoid():
     """What is climbed grows, beyond what its guide reaches; the numbers are those of ``epsilon_quality``."""
     surface = surfaces.Ellipsoid(jnp.array([0.03, 0.04, 0.06]))
-    climbed = placement.place_contacts(surface, fingers=4, objective=Epsilon("L1", 0.06), starts=32)
-    guided = placement.place_contacts(surface, fingers=4, objective=EpsilonFloor(0.06), starts=32)
-    margin = placement.place_contacts(surface, fingers=4, starts=32)
+    climbed = placement.place_contacts(surface, fingers=4, objective=Epsilon("L1", 0.06), search=Search(32))
+    guided = placement.place_contacts(surface, fingers=4, objective=EpsilonFloor(0.06), search=Search(32))
+    margin = placement.place_contacts(surface, fingers=4, search=Search(32))
     assert climbed.resistant.all() and climbed.proved.all()
     epsilon = [
         np.asarray(
@@ -155,8 +164,9 @@ def test_epsilon_as_the_objective_on_an_ellipsoid():
 )
 def test_any_measure_climbs(measure, gains):
     surface = surfaces.Ellipsoid(jnp.array([0.03, 0.04, 0.06]))
-    climbed = placement.place_contacts(surface, objective=measure, starts=8, steps=40, candidates=32)
-    margin = placement.place_contacts(surface, starts=8, steps=40, candidates=32)
+    few = Search(8, steps=40, candidates=32)
+    climbed = placement.place_contacts(surface, objective=measure, search=few)
+    margin = placement.place_contacts(surface, search=few)
 
     def median(out):
         grasp = jg.Grasp(out.end, surface.normal(out.end), jg.HardFinger(0.5))
@@ -171,7 +181,7 @@ def test_any_measure_climbs(measure, gains):
 
 @pytest.mark.slow("test_three_fingers_climb_to_the_equator_of_a_ball")
 def test_most_starts_on_the_mug_end_resistant():
-    out = placement.place_contacts(surfaces.of("mug", resolution=64), fingers=4, starts=128)
+    out = placement.place_contacts(surfaces.of("mug", resolution=64), fingers=4, search=Search(128))
     assert out.resistant.mean() > 0.95
     assert np.median(out.after) > np.median(out.before)
     assert out.proved.all()

@@ -11,14 +11,19 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = {
+    path.relative_to(ROOT): path.read_text(encoding="utf-8")
+    for path in (ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md")))
+}
 CI = ROOT / ".ci" / "run"
 NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e-?\d+)?")
 
 
 def block(name: str) -> str:
-    """The text of the fenced block under the mark ``<!-- name -->``."""
-    found = re.findall(rf"^<!-- {re.escape(name)} -->\n```\w*\n(.*?)^```$", README, re.S | re.M)
-    assert len(found) == 1, f"README.md has {len(found)} blocks marked {name!r}"
+    """The text of the fenced block under the mark ``<!-- name -->`` in the README or in a page of docs/."""
+    mark = re.compile(rf"^<!-- {re.escape(name)} -->\n```\w*\n(.*?)^```$", re.S | re.M)
+    found = [text for page in PAGES.values() for text in mark.findall(page)]
+    assert len(found) == 1, f"{len(found)} blocks are marked {name!r}"
     return found[0]
 
 
@@ -123,12 +128,58 @@ def test_explain_prints_what_is_shown(tmp_path):
     assert (tmp_path / "mug_holds.png").stat().st_size > 10_000
 
 
-def test_linked_files_exist():
-    links = re.findall(r"\]\(([^)#]+)\)|src=\"([^\"]+)\"", README)
+@pytest.mark.parametrize("page", PAGES, ids=str)
+def test_linked_files_exist(page):
+    links = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)|src=\"([^\"]+)\"", PAGES[page])
     local = [target for pair in links for target in pair if target and "://" not in target]
-    assert len(local) >= 5
-    missing = [target for target in local if not (ROOT / target).exists()]
+    assert len(local) >= 5 or page.name != "README.md"
+    missing = [target for target in local if not (ROOT / page.parent / target).exists()]
     assert missing == []
+
+
+def test_every_page_of_docs_can_be_reached():
+    """From the README or from the index of decisions."""
+    index = README + PAGES[Path("docs/decisions/README.md")]
+    pages = [path for path in PAGES if path.parts[0] == "docs"]
+    assert [str(path) for path in pages if f"({path.name})" not in index and f"({path})" not in index] == []
+
+
+# How long, and what is named -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "most"), [("README.md", 200), ("docs/architecture.md", 150)])
+def test_the_first_pages_stay_short(name, most):
+    assert len(PAGES[Path(name)].splitlines()) <= most
+
+
+def test_every_file_named_in_the_architecture_exists():
+    named = set(re.findall(r"`((?:jaxgrasp|tests|benchmarks)/[\w/.]+)`", PAGES[Path("docs/architecture.md")]))
+    assert len(named) >= 20
+    assert sorted(name for name in named if not (ROOT / name).exists()) == []
+
+
+def test_the_architecture_lists_the_rooms_in_their_order_and_shows_their_figures():
+    """What ``python tests/test_rooms.py`` prints stands in the last column between the marks."""
+    page = PAGES[Path("docs/architecture.md")]
+    printed = subprocess.run(
+        [sys.executable, ROOT / "tests" / "test_rooms.py"], capture_output=True, encoding="utf-8", check=True
+    )
+    shown = page.split("<!-- figures -->")[1].split("<!-- /figures -->")[0]
+    rows = [[cell.strip() for cell in row.strip("| ").split("|")] for row in shown.strip().splitlines()[2:]]
+    assert printed.stdout.splitlines() == [f"| {row[0]} | {row[-1]} |" for row in rows]
+    rooms = re.findall(r"^\| `(\w+)` \| .* \| .*\|$", page, re.M)
+    order = re.search(r"^ROOMS = \((.*?)^\)", (ROOT / "tests" / "test_rooms.py").read_text(), re.S | re.M)
+    assert order is not None
+    assert rooms == re.findall(r'"(\w+)"', order[1])
+
+
+def test_the_changelog_knows_every_name_that_moved():
+    """The message of an AttributeError and the table say the same."""
+    source = (ROOT / "jaxgrasp" / "core" / "renamed.py").read_text(encoding="utf-8")
+    moved = re.findall(r'^    "(\w+)": "([\w.]+)",$', source.split("# Modules.")[0], re.M)
+    assert len(moved) > 50
+    page = PAGES[Path("CHANGELOG.md")]
+    assert [old for old, new in moved if f"| `{old}` | `{new}` |" not in page] == []
 
 
 # Notebooks ---------------------------------------------------------------------------------------------
@@ -163,6 +214,12 @@ SCRIPTS = sorted((ROOT / "notebooks").glob("*.py"))
 def test_every_notebook_has_a_script_and_the_other_way_round():
     books = sorted((ROOT / "notebooks").glob("*.ipynb"))
     assert [b.stem for b in books] == [s.stem for s in SCRIPTS] != []
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_notebook_stays_short(script):
+    """At most 200 lines of source; what draws is in ``jaxgrasp.report.plots``."""
+    assert len(script.read_text(encoding="utf-8").splitlines()) <= 200
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)

@@ -7,6 +7,7 @@ import pytest
 from scipy.sparse import csc_matrix
 
 import jaxgrasp as jg
+from jaxgrasp import Status
 
 
 def solved_to(dtype):
@@ -48,9 +49,9 @@ def test_projection_onto_the_semidefinite_cone(dtype):
     clipped = np.maximum(values, 0)
     X = np.einsum("nab,nb,ncb->nac", vectors, clipped, vectors)
     expected = 0.5 * np.sum((X - M) ** 2, axis=(1, 2)) - 0.5 * np.sum(M**2, axis=(1, 2))
-    assert bool(solution.converged.all())
-    np.testing.assert_allclose(solution.value, expected, rtol=2 * solved_to(dtype))
-    assert np.all(np.asarray(solution.bound) <= expected + solved_to(dtype) * np.abs(expected))
+    assert bool((solution.status == Status.OPTIMAL).all())
+    np.testing.assert_allclose(solution.upper, expected, rtol=2 * solved_to(dtype))
+    assert np.all(np.asarray(solution.lower) <= expected + solved_to(dtype) * np.abs(expected))
     near = 3 * np.sqrt(solved_to(dtype)) * np.abs(M).max()  # a quadratic is flat at its minimum
     np.testing.assert_allclose(np.einsum("ni,iab->nab", solution.x, E), X, atol=near)
     np.testing.assert_allclose(solution.dual, X - M, atol=near)
@@ -72,8 +73,8 @@ def test_a_log_det_cost_inverts_a_matrix(dtype):
     solution = jg.lmi.lmi_minimize(jg.lmi.LMIProblem(*loose, log_det=term))
     X = weight * np.linalg.inv(C)
     expected = weight * q - weight * np.linalg.slogdet(X)[1]
-    assert bool(solution.converged)
-    np.testing.assert_allclose(solution.value, expected, rtol=solved_to(dtype))
+    assert solution.status == Status.OPTIMAL
+    np.testing.assert_allclose(solution.upper, expected, rtol=solved_to(dtype))
     np.testing.assert_allclose(
         np.einsum("i,iab->ab", solution.x, E), X, atol=3 * np.sqrt(solved_to(dtype)) * np.abs(X).max()
     )
@@ -81,10 +82,10 @@ def test_a_log_det_cost_inverts_a_matrix(dtype):
 
 def test_a_concave_cost_and_an_unheld_direction_are_refused(dtype):
     concave = jg.lmi.LMIProblem(*arrays(dtype, [1.0], -np.eye(2), [np.eye(2)], [5.0], [[-1.0]]))
-    assert np.isnan(jg.lmi.lmi_minimize(concave).value)
+    assert np.isnan(jg.lmi.lmi_minimize(concave).upper)
     free = jg.lmi.LMIProblem(*arrays(dtype, [1.0, 1.0], -np.eye(2), [np.eye(2), 0 * np.eye(2)], [5.0, 0.0]))
     answer = jg.lmi.lmi_minimize(free)
-    assert not bool(answer.converged)
+    assert answer.status != Status.OPTIMAL
     assert float(answer.gap) == np.inf
 
 
@@ -100,9 +101,8 @@ def test_three_answers_each_with_its_proof(dtype):
         np.array([e, e, x, e, e])[:, None],
     )
     answer = jg.lmi.lmi_feasibility(constant, matrices)
-    np.testing.assert_array_equal(answer.feasible, [True, False, False, False, False])
-    np.testing.assert_array_equal(answer.edge, [False, True, True, False, False])
-    np.testing.assert_array_equal(answer.infeasible, [False, False, False, True, False])
+    expected = [Status.FEASIBLE, Status.MARGINAL, Status.MARGINAL, Status.INFEASIBLE, Status.INVALID]
+    np.testing.assert_array_equal(answer.status, expected)
     assert 10.0 < float(answer.x[0, 0]) < 11.0
     Z = np.asarray(answer.certificate[3], float)
     assert np.linalg.eigvalsh(Z)[0] >= -1e-6
@@ -119,8 +119,8 @@ def test_no_answer_depends_on_units(dtype):
         np.broadcast_to(np.diag([1.0, -1.0]), (3, 1, 2, 2)),
     )
     answer = jg.lmi.lmi_feasibility(constant, matrices)
-    assert bool(answer.feasible.all())
-    np.testing.assert_allclose(answer.depth, answer.depth[0], rtol=1e-3)
+    assert bool((answer.status == Status.FEASIBLE).all())
+    np.testing.assert_allclose(answer.lower, answer.lower[0], rtol=1e-3)
     np.testing.assert_allclose(np.asarray(answer.x)[:, 0] / scale, float(answer.x[0, 0]) * 1e3, rtol=1e-2)
 
 
@@ -169,10 +169,10 @@ def test_random_programs_agree_with_clarabel():
     assert optimal.sum() >= 25
     assert (status == "PrimalInfeasible").sum() >= 15
     assert (status == "DualInfeasible").sum() >= 25
-    np.testing.assert_array_equal(out.converged[optimal], True)
-    np.testing.assert_allclose(np.asarray(out.value)[optimal], best[optimal], rtol=1e-6, atol=1e-6)
+    np.testing.assert_array_equal(out.status[optimal], Status.OPTIMAL)
+    np.testing.assert_allclose(np.asarray(out.upper)[optimal], best[optimal], rtol=1e-6, atol=1e-6)
     assert np.all(
-        np.asarray(out.bound)[optimal] <= best[optimal] + 1e-6 * np.maximum(1, np.abs(best[optimal]))
+        np.asarray(out.lower)[optimal] <= best[optimal] + 1e-6 * np.maximum(1, np.abs(best[optimal]))
     )
     # The multiplier proves the value without the solver: tr(S_i Z) = u_i, Z >= 0, -tr(S_0 Z) = value.
     multiplier = np.asarray(out.Z)
@@ -181,11 +181,13 @@ def test_random_programs_agree_with_clarabel():
     rest = np.abs(np.einsum("niab,nab->ni", S, multiplier) - u).max(-1)
     assert np.all(rest[optimal] < 1e-7 * np.maximum(1, size[optimal]))
     impossible = status == "PrimalInfeasible"
-    assert np.all(np.isposinf(np.asarray(out.value)[impossible]))
+    assert np.all(np.isposinf(np.asarray(out.upper)[impossible]))
     assert np.all(np.einsum("nab,nab->n", constant, multiplier)[impossible] < 0)
     unbounded = status == "DualInfeasible"
     assert np.all(np.asarray(out.gap)[unbounded] == np.inf)
-    assert not np.any(np.asarray(out.converged)[unbounded])
+    assert not np.any(np.asarray(out.status)[unbounded] == Status.OPTIMAL)
+    np.testing.assert_array_equal(out.status[impossible], Status.INFEASIBLE)
+    np.testing.assert_array_equal(out[3].feasibility.status, out.feasibility.status[3])
 
 
 def test_wrong_shapes_are_named():

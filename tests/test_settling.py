@@ -10,6 +10,7 @@ from jaxgrasp import surfaces
 from jaxgrasp.placement import place as placement
 from jaxgrasp.placement.objectives import Measure
 from jaxgrasp.placement.requirements import Apart, Beyond
+from jaxgrasp.placement.search import Search
 from jaxgrasp.placement.settle import CLOUD, settle
 
 MODEL = jg.HardFinger(0.5)
@@ -18,7 +19,7 @@ TARGET = np.array([[0.06, 0.0, 0.0], [0.0, 0.06, 0.0]])
 
 def coarse(subdivisions=1, resolution=32):
     """A ball of 5 cm out of few triangles: a facet's normal is up to 20 degrees off the ball's."""
-    return surfaces.MeshSurface(trimesh.creation.icosphere(subdivisions, radius=0.05), resolution)
+    return surfaces.MeshSurface(trimesh.creation.icosphere(subdivisions, radius=0.05), resolution=resolution)
 
 
 def near_targets(grasp):
@@ -107,7 +108,9 @@ def test_placement_on_large_facets_gains_by_settling():
     """Facets of an icosahedron: the smooth surface that is climbed is another body than the one that is grasped."""
     surface = coarse(0)
     with_, without = (
-        placement.place_contacts(surface, fingers=3, starts=64, steps=60, candidates=64, settling=rounds)
+        placement.place_contacts(
+            surface, fingers=3, search=Search(64, steps=60, candidates=64, settling=rounds)
+        )
         for rounds in (32, 0)
     )
     assert (with_.after >= without.after - 1e-9).all()

@@ -53,7 +53,7 @@ def test_accelerations_agree_in_any_state(scene):
     body, grasp, force, gravity, _, plant = scene
     state = random_states(np.random.default_rng(1), N, 3, speed=3.0)
     wrench = jnp.einsum("nij,nj->ni", jg.motion.world_grasp_map(grasp, state.orientation), force)
-    ours = jg.motion.acceleration(body, state, wrench, gravity)
+    ours = jg.motion.acceleration(body, state, wrench, gravity=gravity)
     assert relative(plant.acceleration(state, wrench), ours).max() < 1e-9
 
 
@@ -61,7 +61,10 @@ def test_one_step_is_semi_implicit_euler(scene):
     body, grasp, force, gravity, _, plant = scene
     state = random_states(np.random.default_rng(2), N, 3, speed=3.0)
     wrench = jnp.einsum("nij,nj->ni", jg.motion.world_grasp_map(grasp, state.orientation), force)
-    theirs, ours = plant.advance(state, wrench), jg.motion.advance(body, state, wrench, H, gravity)
+    theirs, ours = (
+        plant.advance(state, wrench),
+        jg.motion.advance(body, state, wrench, timestep=H, gravity=gravity),
+    )
     assert relative(tangent_difference(theirs, ours), np.zeros((N, 12))).max() < 1e-9
 
 
@@ -129,7 +132,7 @@ def test_derivatives_hold_in_motion_too(scene):
         def motion(x, f):
             moved = tangent(state, x)
             return jg.motion.acceleration(
-                body, moved, jg.motion.world_grasp_map(grasp, moved.orientation) @ f, gravity
+                body, moved, jg.motion.world_grasp_map(grasp, moved.orientation) @ f, gravity=gravity
             )
 
         return jax.jacfwd(motion, argnums=(0, 1))(jnp.zeros(12), force)
@@ -191,7 +194,7 @@ def test_rollouts_are_those_of_the_c_engine(scene):
 
     def step(now, f):
         wrench = jnp.einsum("nij,nj->ni", jg.motion.world_grasp_map(grasp, now.orientation), f)
-        after = jg.motion.advance(body, now, wrench, H, gravity)
+        after = jg.motion.advance(body, now, wrench, timestep=H, gravity=gravity)
         return after, after
 
     ours = jax.lax.scan(step, start, force)[1]

@@ -347,7 +347,11 @@ def test_exact_at_metre_scale(name, mug, block):
     mesh = objects.make_object(name)
     mesh.apply_scale(10)
     mesh.apply_translation((10.0, -7.0, 3.0))
-    surface = surfaces.MeshSurface(mesh, 16) if name == "box" else surfaces.MeshSurface(mesh, 64)
+    surface = (
+        surfaces.MeshSurface(mesh, resolution=16)
+        if name == "box"
+        else surfaces.MeshSurface(mesh, resolution=64)
+    )
     random = np.random.default_rng(0)
     on, _ = surface.sample(0, 40)
     point = np.concatenate(
@@ -524,7 +528,7 @@ def test_points_far_outside_and_without_numbers(block):
 def test_an_open_mesh_warns_and_its_rim_is_sharp():
     mesh = objects.make_object("sphere")
     mesh.update_faces(mesh.triangles_center[:, 2] < 0.02)
-    surface = surfaces.MeshSurface(mesh, 40)
+    surface = surfaces.MeshSurface(mesh, resolution=40)
     assert any("not watertight" in w for w in surface.warnings)
     rim = surface.triangles.sharp.reshape(-1, 3) + surface.triangles.middle
     assert len(rim) and np.abs(rim[:, 2] - 0.02).max() < 0.004
@@ -541,7 +545,7 @@ def test_meshes_that_are_no_surface():
     vertices, faces = np.asarray(box.vertices), np.asarray(box.faces)
 
     def surface(vertices, faces, **options):
-        return surfaces.MeshSurface(trimesh.Trimesh(vertices, faces, process=False), 16, **options)
+        return surfaces.MeshSurface(trimesh.Trimesh(vertices, faces, process=False), resolution=16, **options)
 
     with pytest.raises(UserError, match="no faces"):
         surface(vertices, np.zeros((0, 3), int))
@@ -556,7 +560,7 @@ def test_meshes_that_are_no_surface():
     with pytest.raises(UserError, match=r"too thin for the grid.*resolution above 16"):
         surface(vertices * [1, 1, 0.01], faces)
     with pytest.raises(ValueError, match="resolution must be"):
-        surfaces.MeshSurface(box, 8)
+        surfaces.MeshSurface(box, resolution=8)
     with pytest.raises(ValueError, match="crease must be"):
         surface(vertices, faces, crease=0.0)
     with pytest.raises(ValueError, match="centre must be"):
@@ -566,13 +570,13 @@ def test_meshes_that_are_no_surface():
 def test_surfaces_of_names_files_and_bodies(tmp_path):
     path = tmp_path / "box.stl"
     trimesh.creation.box(extents=(100, 80, 60)).export(path)
-    surface = surfaces.of(path, "mm", com=(0, 0, 0.01), resolution=24)
+    surface = surfaces.of(path, unit="mm", com=(0, 0, 0.01), resolution=24)
     assert float(surface.radius) == pytest.approx(np.linalg.norm([0.05, 0.04, 0.04]), rel=1e-6)
     assert np.asarray(surface.centre) == pytest.approx([0, 0, 0.01])
-    body = objects.load_mesh(path, "mm")
+    body = objects.load_mesh(path, unit="mm")
     assert np.asarray(surfaces.of(body, resolution=24).centre) == pytest.approx([0, 0, 0], abs=1e-9)
     with pytest.raises(ValueError, match="a Body has its unit"):
-        surfaces.of(body, "mm")
+        surfaces.of(body, unit="mm")
     with pytest.raises(UserError, match="no such file"):
         surfaces.of(tmp_path / "none.stl")
 
@@ -592,7 +596,7 @@ def test_surfaces_of_names_files_and_bodies(tmp_path):
     ],
 )
 def test_real_meshes(file, unit):
-    surface = surfaces.of(real_meshes() / file, unit)
+    surface = surfaces.of(real_meshes() / file, unit=unit)
     cell, size = float(surface.grid.spacing), float(surface.radius)
     point, _ = surface.sample(0, 5000)
     point = point + np.random.default_rng(0).normal(0, 0.3 * cell, point.shape)

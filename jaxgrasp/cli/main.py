@@ -107,7 +107,7 @@ def _mesh(source: str | None, metadata: dict):
         say("the file does not name its object: drawing the contacts only (--object names a mesh)")
         return None
     try:
-        body = load_mesh(name, metadata.get("unit", "m"))
+        body = load_mesh(name, unit=metadata.get("unit", "m"))
     except UserError as error:
         if source is not None:
             raise

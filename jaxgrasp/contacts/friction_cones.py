@@ -35,7 +35,7 @@ def cone_use(grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*b
 
 
 def into_cones(
-    grasp: Grasp, force: Float[Array, "*batch kn"], cap: Array | None = None
+    grasp: Grasp, force: Float[Array, "*batch kn"], *, cap: Float[Array, "*batch k"] | None = None
 ) -> Float[Array, "*batch kn"]:
     """``force`` with friction cut down to its cone, pulls to zero, and normal forces to ``cap``: last digits only."""
     scaled, scale, index = _scaled(grasp, force)

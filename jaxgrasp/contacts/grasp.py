@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
-from ..core import Array, Bool, Float, real_array
+from ..core import Array, ArrayLike, Bool, Float, Index, real_array
 from .models import ContactModel
 
 __all__ = ["Grasp"]
 
 
-def _vectors(value, name: str) -> Array:
+def _vectors(value: ArrayLike, name: str) -> Array:
     array = real_array(value, name, "an array of shape (*batch, k, 3) or (*batch, k, 2)")
     if array.ndim < 2 or array.shape[-1] not in (2, 3) or array.shape[-2] < 1:
         raise ValueError(
@@ -51,7 +52,13 @@ class Grasp(eqx.Module):
     model: ContactModel
     active: Bool[Array, "*batch k"]
 
-    def __init__(self, position, normal, model: ContactModel, active=None):
+    def __init__(
+        self,
+        position: Float[ArrayLike, "*batch k d"],
+        normal: Float[ArrayLike, "*batch k d"],
+        model: ContactModel,
+        active: Bool[ArrayLike, "*batch k"] | None = None,
+    ):
         position, normal = _vectors(position, "position"), _vectors(normal, "normal")
         if not isinstance(model, ContactModel):
             raise ValueError(
@@ -97,13 +104,15 @@ class Grasp(eqx.Module):
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
+        """Axes in front of the contacts'; () for a single grasp."""
         return self.position.shape[:-2]
 
     @property
-    def dtype(self):
+    def dtype(self) -> np.dtype:
+        """The dtype of all its real numbers."""
         return self.position.dtype
 
-    def __getitem__(self, index) -> Grasp:
+    def __getitem__(self, index: Index) -> Grasp:
         """The grasps at ``index`` of the batch."""
         if not self.batch_shape:
             raise IndexError("a single grasp has no batch axis to index")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..core import Array, Float, contact_frame, cross, normalize, rank_tolerance, wrench_dimension
+from ..core import Array, Float, Int, contact_frame, cross, normalize, rank_tolerance, wrench_dimension
 from .grasp import Grasp
 from .models import Component
 
@@ -99,7 +99,7 @@ def grasp_singular_values(grasp: Grasp) -> Float[Array, "*batch m"]:
 
 
 @eqx.filter_jit
-def grasp_rank(grasp: Grasp) -> Float[Array, "*batch"]:
+def grasp_rank(grasp: Grasp) -> Int[Array, "*batch"]:
     """Rank of the folded grasp map: singular values above ``64 eps`` times the largest one."""
     values = grasp_singular_values(grasp)
     return jnp.sum(values > rank_tolerance(grasp.dtype) * values[..., :1], axis=-1)

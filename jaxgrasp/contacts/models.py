@@ -12,12 +12,11 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from enum import Enum
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..core import Array, Float, real_array
+from ..core import Array, ArrayLike, Float, real_array
 
 __all__ = [
     "Component",
@@ -50,16 +49,18 @@ class ContactModel(eqx.Module):
 
     @property
     @abstractmethod
-    def friction_coefficient(self) -> Array:
-        """mu of (11.3), per contact."""
+    def friction_coefficient(self) -> Float[Array, "*contacts"]:
+        """``mu`` of (11.3), per contact."""
 
     @property
     @abstractmethod
-    def torsion_coefficient(self) -> Array:
-        """gamma of (11.34) in m, per contact."""
+    def torsion_coefficient(self) -> Float[Array, "*contacts"]:
+        """``gamma`` of (11.34) in m, per contact."""
 
     @abstractmethod
-    def with_coefficients(self, friction: Array, torsion: Array) -> ContactModel:
+    def with_coefficients(
+        self, friction: Float[Array, "*contacts"], torsion: Float[Array, "*contacts"]
+    ) -> ContactModel:
         """The same model with other coefficients."""
 
     @abstractmethod
@@ -67,7 +68,9 @@ class ContactModel(eqx.Module):
         """The S_j of ``P(f) = sum_j f_j S_j >= 0`` (11.9), one stack per contact."""
 
     @abstractmethod
-    def log_det_terms(self, dimension: int) -> tuple[Array, Array, Array]:
+    def log_det_terms(
+        self, dimension: int
+    ) -> tuple[Float[Array, "*contacts"], Float[Array, "*contacts"], Float[Array, "*contacts"]]:
         """(a, b, c), per contact, of ``log det P(f) = a log f_n + b log(f_n^2 - psi^2) + c`` for (11.4), (11.35).
 
         Wherever mu = 0, P is the scalar f_n: a = 1, b = c = 0.
@@ -146,29 +149,39 @@ def _where_rough(friction: Array, value: float, otherwise: float) -> Array:
 class Frictionless(ContactModel):
     """Frictionless point contact: ``f = (f_n)``, ``f_n >= 0``, ``P(f) = f_n``."""
 
-    zero: Array
+    zero: Float[Array, "*contacts"]
 
-    def __init__(self, zero: Any = 0.0):  # zeros in the shape of the contacts
+    def __init__(self, zero: Float[ArrayLike, "*contacts"] = 0.0):  # zeros in the shape of the contacts
         self.zero = real_array(zero, "the placeholder")
 
     def components(self, dimension: int) -> tuple[Component, ...]:
+        """``(f_n)``."""
         return (Component.NORMAL,)
 
     @property
-    def friction_coefficient(self) -> Array:
+    def friction_coefficient(self) -> Float[Array, "*contacts"]:
+        """``mu = 0``, no unit."""
         return jnp.zeros_like(self.zero)
 
     @property
-    def torsion_coefficient(self) -> Array:
+    def torsion_coefficient(self) -> Float[Array, "*contacts"]:
+        """``gamma = 0``, m."""
         return jnp.zeros_like(self.zero)
 
-    def with_coefficients(self, friction: Array, torsion: Array) -> Frictionless:
+    def with_coefficients(
+        self, friction: Float[Array, "*contacts"], torsion: Float[Array, "*contacts"]
+    ) -> Frictionless:
+        """A frictionless model in the shape of ``friction``; both coefficients stay 0."""
         return Frictionless(jnp.zeros_like(friction))
 
     def lmi_matrices(self, dimension: int) -> Float[Array, "*contacts 1 1 1"]:
+        """``S = [[1]]``: P(f) = f_n."""
         return jnp.ones((*self.zero.shape, 1, 1, 1), self.zero.dtype)
 
-    def log_det_terms(self, dimension: int) -> tuple[Array, Array, Array]:
+    def log_det_terms(
+        self, dimension: int
+    ) -> tuple[Float[Array, "*contacts"], Float[Array, "*contacts"], Float[Array, "*contacts"]]:
+        """``log f_n``: (1, 0, 0)."""
         zero = jnp.zeros_like(self.zero)
         return zero + 1, zero, zero
 
@@ -179,25 +192,31 @@ class HardFinger(ContactModel):
     ``friction`` is mu >= 0: a number, or one per contact. In the plane the force is ``(f_t, f_n)``.
     """
 
-    friction: Array
+    friction: Float[Array, "*contacts"]
 
-    def __init__(self, friction: Any = 0.5):
+    def __init__(self, friction: Float[ArrayLike, "*contacts"] = 0.5):
         self.friction = real_array(friction, "friction")
 
     def components(self, dimension: int) -> tuple[Component, ...]:
+        """``(f_x, f_y, f_n)``, in the plane ``(f_t, f_n)``."""
         if dimension == 2:
             return (Component.TANGENT_1, Component.NORMAL)
         return (Component.TANGENT_1, Component.TANGENT_2, Component.NORMAL)
 
     @property
-    def friction_coefficient(self) -> Array:
+    def friction_coefficient(self) -> Float[Array, "*contacts"]:
+        """``mu`` of (11.3), no unit."""
         return self.friction
 
     @property
-    def torsion_coefficient(self) -> Array:
+    def torsion_coefficient(self) -> Float[Array, "*contacts"]:
+        """``gamma = 0``, m."""
         return jnp.zeros_like(self.friction)
 
-    def with_coefficients(self, friction: Array, torsion: Array) -> HardFinger:
+    def with_coefficients(
+        self, friction: Float[Array, "*contacts"], torsion: Float[Array, "*contacts"]
+    ) -> HardFinger:
+        """Hard fingers with mu = ``friction``; gamma stays 0."""
         return HardFinger(friction)
 
     def lmi_matrices(self, dimension: int) -> Float[Array, "*contacts n q q"]:
@@ -210,7 +229,9 @@ class HardFinger(ContactModel):
         diagonal = jnp.where(mu > 0, mu, jnp.ones_like(mu))
         return _arrow_matrices([tangent] * (dimension - 1), diagonal, self.normal_index(dimension))
 
-    def log_det_terms(self, dimension: int) -> tuple[Array, Array, Array]:
+    def log_det_terms(
+        self, dimension: int
+    ) -> tuple[Float[Array, "*contacts"], Float[Array, "*contacts"], Float[Array, "*contacts"]]:
         """``dimension log mu + (dimension - 2) log f_n + log(f_n^2 - psi^2)``."""
         mu = self.friction
         safe = jnp.where(mu > 0, mu, jnp.ones_like(mu))
@@ -224,14 +245,17 @@ class SoftFinger(ContactModel):
     per contact. A planar soft finger does not exist.
     """
 
-    friction: Array
-    torsion: Array
+    friction: Float[Array, "*contacts"]
+    torsion: Float[Array, "*contacts"]
 
-    def __init__(self, friction: Any = 0.5, torsion: Any = 0.01):
+    def __init__(
+        self, friction: Float[ArrayLike, "*contacts"] = 0.5, torsion: Float[ArrayLike, "*contacts"] = 0.01
+    ):
         self.friction = real_array(friction, "friction")
         self.torsion = real_array(torsion, "torsion")
 
     def components(self, dimension: int) -> tuple[Component, ...]:
+        """``(f_x, f_y, f_n, tau_n)``; ValueError in the plane."""
         if dimension == 2:
             raise ValueError(
                 "a planar soft finger does not exist: torsion acts about the normal, which lies in the "
@@ -240,14 +264,19 @@ class SoftFinger(ContactModel):
         return (Component.TANGENT_1, Component.TANGENT_2, Component.NORMAL, Component.SPIN)
 
     @property
-    def friction_coefficient(self) -> Array:
+    def friction_coefficient(self) -> Float[Array, "*contacts"]:
+        """``mu`` of (11.3), no unit."""
         return self.friction
 
     @property
-    def torsion_coefficient(self) -> Array:
+    def torsion_coefficient(self) -> Float[Array, "*contacts"]:
+        """``gamma`` of (11.34), m."""
         return self.torsion
 
-    def with_coefficients(self, friction: Array, torsion: Array) -> SoftFinger:
+    def with_coefficients(
+        self, friction: Float[Array, "*contacts"], torsion: Float[Array, "*contacts"]
+    ) -> SoftFinger:
+        """Soft fingers with mu = ``friction`` and gamma = ``torsion`` in m."""
         return SoftFinger(friction, torsion)
 
     def lmi_matrices(self, dimension: int) -> Float[Array, "*contacts 4 4 4"]:
@@ -261,7 +290,9 @@ class SoftFinger(ContactModel):
         ]
         return _arrow_matrices(inverses, jnp.ones_like(self.friction), self.normal_index(dimension))
 
-    def log_det_terms(self, dimension: int) -> tuple[Array, Array, Array]:
+    def log_det_terms(
+        self, dimension: int
+    ) -> tuple[Float[Array, "*contacts"], Float[Array, "*contacts"], Float[Array, "*contacts"]]:
         """``2 log f_n + log(f_n^2 - psi^2)``."""
         mu = self.friction
         return _where_rough(mu, 2, 1), _where_rough(mu, 1, 0), jnp.zeros_like(mu)
@@ -271,7 +302,9 @@ class SoftFinger(ContactModel):
 MODELS: dict[str, type[ContactModel]] = {"hard": HardFinger, "soft": SoftFinger, "frictionless": Frictionless}
 
 
-def contact_model(name: str, friction: Any, torsion: Any) -> ContactModel:
+def contact_model(
+    name: str, friction: Float[ArrayLike, "*batch"], torsion: Float[ArrayLike, "*batch"]
+) -> ContactModel:
     """The model of this name in ``MODELS`` with mu and gamma (m) per contact; those it does not have are left out."""
     return MODELS[name]().with_coefficients(jnp.asarray(friction), jnp.asarray(torsion))
 

@@ -1,7 +1,7 @@
 """Ground floor: array vocabulary, tolerances by dtype, statuses, rigid-body geometry, errors. It knows no grasp."""
 
 from .answer import Answer
-from .arrays import Array, Bool, Float, Int, real_array
+from .arrays import Array, ArrayLike, Bool, Float, Index, Int, real_array
 from .broadcast import spread
 from .errors import UserError
 from .geometry import (
@@ -49,8 +49,10 @@ from .version import __version__
 __all__ = [
     "Answer",
     "Array",
+    "ArrayLike",
     "Bool",
     "Float",
+    "Index",
     "Int",
     "Status",
     "UserError",

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import equinox as eqx
 import jax
 import numpy as np
 from jax.core import Tracer
 
-from .arrays import Array, Int
+from .arrays import Array, Index, Int
 from .status import Status
 
 __all__ = ["Answer"]
@@ -37,7 +37,7 @@ class Answer(eqx.Module):
         """Axes of the batch: those of ``status``."""
         return tuple(np.shape(self.status))
 
-    def __getitem__(self, index: Any) -> Self:
+    def __getitem__(self, index: Index) -> Self:
         """The answers at ``index`` of the batch. IndexError where there is no batch axis."""
         if not self.batch_shape:
             raise IndexError("a single answer has no batch axis to index")

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+from types import EllipsisType
 
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-__all__ = ["Array", "Bool", "Float", "Int", "real_array"]
+__all__ = ["Array", "ArrayLike", "Bool", "Float", "Index", "Int", "real_array"]
+
+# What a batch is indexed by, as NumPy does it.
+Index = int | slice | EllipsisType | ArrayLike | tuple[int | slice | EllipsisType | ArrayLike, ...]
 
 
-def real_array(value: Any, name: str, means: str = "a number or an array of numbers") -> Array:
+def real_array(value: ArrayLike, name: str, means: str = "a number or an array of numbers") -> Array:
     """``value`` as an array of a floating dtype; ValueError, with what it ``means``, where it holds no real numbers."""
     try:
         array = jnp.asarray(value)

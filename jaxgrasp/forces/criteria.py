@@ -12,13 +12,12 @@ cost as the pieces a cone program is made of:
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from ..contacts import Component, Grasp
-from ..core import Array, Float
+from ..core import Array, ArrayLike, Float
 
 __all__ = ["Criterion", "Gentlest", "LeastNorm", "Robust", "SmallestSum", "SumOfSquares"]
 
@@ -46,13 +45,15 @@ class Criterion(eqx.Module):
         """Whether the sum of the normal forces is the cost."""
         return False
 
-    def curvature(self, component: Component, friction: Array, torsion: Array) -> Array | None:
+    def curvature(
+        self, component: Component, friction: Float[Array, "*lanes"], torsion: Float[Array, "*lanes"]
+    ) -> Float[Array, "*lanes"] | None:
         """c in ``c s^2``, the cost of a scaled component s (f = mu s, gamma s or s); None: no such cost."""
         return None
 
     @property
-    def barrier_weight(self) -> Array | None:
-        """N for each unit of -log det P; None where the barrier is no part of the cost."""
+    def barrier_weight(self) -> Float[Array, "*batch"] | None:
+        """``w`` in ``-w log det P``, in N; None where the barrier is no part of the cost."""
         return None
 
     @abstractmethod
@@ -65,9 +66,11 @@ class Gentlest(Criterion):
 
     @property
     def level(self) -> bool:
+        """``max_i f_n,i`` counts: True."""
         return True
 
     def cost(self, grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch"]:
+        """``max_i f_n,i``, N."""
         normal = _normal_forces(grasp, force)
         return jnp.max(jnp.where(grasp.active, normal, -jnp.inf), axis=-1)
 
@@ -80,20 +83,23 @@ class Robust(Criterion):
     logarithm. The cost is in N up to the constant that a change of the unit under the logarithm adds.
     """
 
-    weight: Array
+    weight: Float[Array, "*batch"]
 
-    def __init__(self, weight: Any = 1.0):
+    def __init__(self, weight: Float[ArrayLike, "*batch"] = 1.0):
         self.weight = _positive(weight, "weight")
 
     @property
     def level(self) -> bool:
+        """``max_i f_n,i`` counts: True."""
         return True
 
     @property
-    def barrier_weight(self) -> Array | None:
+    def barrier_weight(self) -> Float[Array, "*batch"] | None:
+        """``weight``, N."""
         return self.weight
 
     def cost(self, grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch"]:
+        """``max_i f_n,i - weight * sum_i log det P_i``, N; infinite outside the cones."""
         normal = _normal_forces(grasp, force)
         top = jnp.max(jnp.where(grasp.active, normal, -jnp.inf), axis=-1)
         on_normal, on_cone, constant = grasp.model.log_det_terms(grasp.dimension)
@@ -112,19 +118,25 @@ class SmallestSum(Criterion):
 
     @property
     def price(self) -> bool:
+        """``sum_i f_n,i`` is the cost: True."""
         return True
 
     def cost(self, grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch"]:
+        """``sum_i f_n,i``, N."""
         return jnp.sum(_normal_forces(grasp, force), axis=-1)
 
 
 class SumOfSquares(Criterion):
     """``sum_i f_n,i^2`` in N^2: evenly shared normal forces (11.3, sum of squared normal forces)."""
 
-    def curvature(self, component: Component, friction: Array, torsion: Array) -> Array | None:
+    def curvature(
+        self, component: Component, friction: Float[Array, "*lanes"], torsion: Float[Array, "*lanes"]
+    ) -> Float[Array, "*lanes"] | None:
+        """1 for the normal component, 0 for the others."""
         return jnp.ones_like(friction) if component is Component.NORMAL else jnp.zeros_like(friction)
 
     def cost(self, grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch"]:
+        """``sum_i f_n,i^2``, N^2."""
         normal = _normal_forces(grasp, force)
         return jnp.sum(normal * normal, axis=-1)
 
@@ -136,12 +148,15 @@ class LeastNorm(Criterion):
     gamma of each contact, which weighs the largest torque like the normal force it comes from.
     """
 
-    length: Array | None
+    length: Float[Array, "*batch"] | None
 
-    def __init__(self, length: Any = None):
+    def __init__(self, length: Float[ArrayLike, "*batch"] | None = None):
         self.length = None if length is None else _positive(length, "length")
 
-    def curvature(self, component: Component, friction: Array, torsion: Array) -> Array | None:
+    def curvature(
+        self, component: Component, friction: Float[Array, "*lanes"], torsion: Float[Array, "*lanes"]
+    ) -> Float[Array, "*lanes"] | None:
+        """``mu^2``, ``(gamma / length)^2`` or 1, as the component is scaled."""
         if component is Component.NORMAL:
             return jnp.ones_like(friction)
         if component is not Component.SPIN:
@@ -152,6 +167,7 @@ class LeastNorm(Criterion):
         return ratio * ratio
 
     def cost(self, grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch"]:
+        """``sum_i |f_i|^2``, N^2."""
         parts = _by_contact(grasp, force)
         total = jnp.zeros(parts.shape[:-1], parts.dtype)
         gamma = grasp.model.torsion_coefficient
@@ -167,7 +183,7 @@ class LeastNorm(Criterion):
         return jnp.sum(jnp.where(grasp.active, total, 0.0), axis=-1)
 
 
-def _positive(value: Any, name: str) -> Array:
+def _positive(value: ArrayLike, name: str) -> Array:
     array = jnp.asarray(value)
     if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
         raise ValueError(f"{name} must be a positive number, or one per grasp, got {value!r}")

@@ -25,7 +25,7 @@ PLAIN: dict[str, type[Criterion]] = {
 }
 
 
-def make_criterion(name: str, weight: float | None = None, length: float | None = None) -> Criterion:
+def make_criterion(name: str, *, weight: float | None = None, length: float | None = None) -> Criterion:
     """The criterion of this name; UserError where the name is unknown or the option is another's."""
     if name not in CRITERIA:
         raise UserError(f"unknown criterion {name!r}; take one of {', '.join(CRITERIA)}")
@@ -46,5 +46,6 @@ def closeness(tolerance: float) -> float:
 
 
 def positive_option(option: str, value: float | None) -> None:
+    """UserError where the option's value is given and not a positive finite number."""
     if value is not None and not (np.isfinite(value) and value > 0):
         raise UserError(f"--{option} must be a number > 0, got {value}")

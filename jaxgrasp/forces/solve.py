@@ -222,6 +222,18 @@ def _solved(plan: _Plan, rows: Rows, tolerance: Array) -> Solved:
 # The question --------------------------------------------------------------------------------------------
 
 
+def _expect(grasp: Grasp, criterion: Criterion, tolerance: float, smoothing: float) -> None:
+    """ValueError where an argument of ``optimize_forces`` is of the wrong kind."""
+    if not isinstance(grasp, Grasp):
+        raise ValueError(f"optimize_forces takes a jaxgrasp.Grasp, got {type(grasp).__name__}")
+    if not isinstance(criterion, Criterion):
+        raise ValueError(f"criterion must be an object such as jaxgrasp.Gentlest(), got {criterion!r}")
+    if isinstance(tolerance, int | float) and not tolerance > 0:
+        raise ValueError(f"tolerance must be positive, got {tolerance}")
+    if not isinstance(smoothing, int | float) or not smoothing >= 0:
+        raise ValueError(f"smoothing must be a number of at least 0, got {smoothing!r}")
+
+
 def optimize_forces(
     grasp: Grasp,
     wrench: Float[ArrayLike, "*batch m"],
@@ -262,15 +274,8 @@ def optimize_forces(
     without either is STALLED, one with bad numbers INVALID. Nothing raises inside; wrong shapes raise ValueError.
     Sources: Buss, Hashimoto, Moore 1996; Han, Trinkle, Li 2000; Boyd, Wegbreit 2007.
     """
-    if not isinstance(grasp, Grasp):
-        raise ValueError(f"optimize_forces takes a jaxgrasp.Grasp, got {type(grasp).__name__}")
     criterion = Gentlest() if criterion is None else criterion
-    if not isinstance(criterion, Criterion):
-        raise ValueError(f"criterion must be an object such as jaxgrasp.Gentlest(), got {criterion!r}")
-    if isinstance(tolerance, int | float) and not tolerance > 0:
-        raise ValueError(f"tolerance must be positive, got {tolerance}")
-    if not isinstance(smoothing, int | float) or not smoothing >= 0:
-        raise ValueError(f"smoothing must be a number of at least 0, got {smoothing!r}")
+    _expect(grasp, criterion, tolerance, smoothing)
     components = grasp.model.components(grasp.dimension)
     loads, shape = spread_loads(grasp, wrench)
     rows = demand_rows(grasp, loads, shape, criterion, max_normal, torque_limits)

@@ -31,6 +31,7 @@ from ..motion import (
     Controllability,
     Gains,
     RigidBody,
+    Simulation,
     close_loop,
     controllability,
     regulator,
@@ -165,13 +166,10 @@ def _disturbed(
         body,
         controller=controller,
         state=start,
-        steps=STEPS,
-        timestep=TIMESTEP,
-        reference=None,
+        simulation=Simulation(STEPS, timestep=TIMESTEP, gravity=gravity),
         disturbance=np.tile(push, (1, n, 1)),
-        gravity=gravity,
     )
-    settled = np.asarray(out.settled(NEAR, float(LEVEL)))
+    settled = np.asarray(out.settled(position=NEAR, orientation=float(LEVEL)))
     fine = (Status.COMMANDED.value, Status.PROJECTED.value)
     good = np.isin(np.asarray(out.status), fine).all(axis=0) & (settled < STEPS)
     use = np.asarray(out.cone_use).max(axis=0)

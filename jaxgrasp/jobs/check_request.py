@@ -108,7 +108,7 @@ def _solid(request: CheckRequest, grasps: ScreenPlan) -> Body:
     name = request.object or (grasps.metadata.get("object") or {}).get("name")
     if name is None:
         raise UserError("the file does not name its object, whose inertia is needed: --object names a mesh")
-    solid = load_mesh(name, grasps.metadata.get("unit", "m"))
+    solid = load_mesh(name, unit=grasps.metadata.get("unit", "m"))
     if not solid.watertight or not solid.mesh.volume > 0:
         raise UserError(
             f"{name} encloses no volume, so its inertia is unknown; repair it or name another --object"

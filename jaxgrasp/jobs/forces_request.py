@@ -174,7 +174,7 @@ def _source(name: str) -> GraspFile | SavedGrasps:
 
 def plan_forces(request: ForcesRequest) -> ForcesPlan:
     """Check the request and open its source. UserError: one line saying what to do."""
-    criterion = make_criterion(request.criterion, request.weight, request.length)
+    criterion = make_criterion(request.criterion, weight=request.weight, length=request.length)
     status = _status(request.status)
     positive_option("tolerance", request.tolerance)
     positive_option("max-normal", request.max_normal)

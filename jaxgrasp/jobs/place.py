@@ -22,7 +22,7 @@ from ..backend import precision
 from ..contacts import contact_model
 from ..core import Status, UserError
 from ..formats import Contacts, Verdicts, read_row, verdict_schema, verdict_table, write
-from ..placement import FLOOR, Placement, PlacementProgress, place_contacts
+from ..placement import FLOOR, Placement, PlacementProgress, Search, place_contacts
 from ..report import Verdict, draw
 from ..surfaces import MeshSurface
 from .place_request import OBJECTIVES, PlacePlan
@@ -73,19 +73,16 @@ def place(plan: PlacePlan, progress: Callable[[str, int, str], None] | None = No
 
     tell("measuring the object", 0, "")
     with precision("float64"):
-        surface = MeshSurface.from_body(plan.body, request.resolution)
+        surface = MeshSurface.from_body(plan.body, resolution=request.resolution)
         tell("screening", 0, "compiling")
         found = place_contacts(
             surface,
-            request.fingers,
-            contact_model(contact.kind, contact.friction, contact.torsion),
-            OBJECTIVES[request.objective](float(surface.radius)),
-            request.starts,
-            request.steps,
+            fingers=request.fingers,
+            model=contact_model(contact.kind, contact.friction, contact.torsion),
+            objective=OBJECTIVES[request.objective](float(surface.radius)),
             requirements=plan.requirements,
-            candidates=request.candidates,
+            search=Search(request.starts, request.steps, request.candidates, seed=request.seed),
             best=request.best,
-            seed=request.seed,
             progress=climbed,
         )
         kept = np.flatnonzero(np.asarray(found.verdict.status) == Status.RESISTANT)

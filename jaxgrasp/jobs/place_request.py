@@ -83,7 +83,7 @@ def plan_place(request: PlaceRequest) -> PlacePlan:
     requirements = _requirements(request)
     contact = ContactChoice.of(request.model, request.friction, request.torsion)
     _enough_fingers(request.fingers, contact)
-    body = load_mesh(request.source, request.unit)
+    body = load_mesh(request.source, unit=request.unit)
     output = request.output or default_output(request.source, "placed.parquet")
     not_the_source(output, request.source)
     writable(output)

@@ -136,7 +136,9 @@ def _solve_chunk(plan: ScreenPlan, solver: Solver, chunk: Chunk, shards: Shards,
     offered = len(contacts)
     if plan.request.filter:
         assert contacts.friction is not None and contacts.active is not None
-        reasons = geometric_filter(contacts.position, contacts.normal, contacts.friction, contacts.active)
+        reasons = geometric_filter(
+            contacts.position, contacts.normal, friction=contacts.friction, active=contacts.active
+        )
         removed = {reason: int(rows.sum()) for reason, rows in reasons.items()}
         contacts = contacts.taken(~np.any(list(reasons.values()), axis=0))
     verdicts, seconds = solver(contacts)

@@ -218,12 +218,12 @@ def _from_mesh(request: ScreenRequest) -> tuple[ContactChoice, Candidates]:
     pairs = request.sampler == "antipodal" or (request.sampler == "auto" and two_soft)
     if pairs and fingers != 2:
         raise UserError(f"antipodal pairs have two contacts; take --fingers 2, not {fingers}")
-    body = load_mesh(request.source, request.unit, request.com)
+    body = load_mesh(request.source, unit=request.unit, com=request.com)
     source: SurfaceSampler | AntipodalSampler
     if pairs:
-        source = AntipodalSampler(body.mesh, contact.friction, request.seed)
+        source = AntipodalSampler(body.mesh, friction=contact.friction, seed=request.seed)
     else:
-        source = SurfaceSampler(body.mesh, fingers, request.seed)
+        source = SurfaceSampler(body.mesh, fingers=fingers, seed=request.seed)
     samples = 100_000 if request.samples is None else request.samples
     about = {
         "object": {"name": body.name, "sha256": body.sha256},

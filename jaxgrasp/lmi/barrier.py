@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..core import Array, gap_floor, rank_tolerance, unit_roundoff
+from ..core import Array, Status, gap_floor, rank_tolerance, unit_roundoff
 from .problem import LMIProblem, LMISolution, LogDetTerm, check_shapes, over_batch
 
 __all__ = ["gap_goal", "lmi_minimize", "minimize"]
@@ -203,19 +203,6 @@ def _minimize(problem: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
 
     space = _coordinates(problem, term, root)
 
-    def at(x: Array) -> tuple[Array, Array, Array]:
-        """Both factors, not finite outside the domain, and the cost."""
-        factor, term_factor = jnp.linalg.cholesky(problem.Q(x)), jnp.linalg.cholesky(term.B(x))
-        quadratic = problem.cost @ x + jnp.sum((root @ x) ** 2) / 2
-        return (
-            factor,
-            term_factor,
-            quadratic - 2 * term.weight * jnp.sum(jnp.log(jnp.diagonal(term_factor))),
-        )
-
-    def inside(*arrays: Array) -> Array:
-        return jnp.all(jnp.stack([jnp.all(jnp.isfinite(array)) for array in arrays]))
-
     def good(iterate: _Iterate) -> Array:
         return iterate.value - iterate.bound <= goal * jnp.maximum(1.0, jnp.abs(iterate.value))
 
@@ -225,8 +212,8 @@ def _minimize(problem: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
     def advance(iterate: _Iterate) -> _Iterate:
         step = _newton_step(problem, term, space, iterate)
         x = iterate.x + step.length * step.direction
-        factor, term_factor, value = at(x)
-        usable = inside(factor, term_factor, x, value)
+        factor, term_factor, value = _evaluated(problem, term, root, x)
+        usable = _finite(factor, term_factor, x, value)
         better = step.proves & (step.bound > iterate.bound)
         return _Iterate(
             x=jnp.where(usable, x, iterate.x),
@@ -240,8 +227,8 @@ def _minimize(problem: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
             stalled=~usable,
         )
 
-    factor, term_factor, value = at(problem.start)
-    interior = inside(factor, term_factor, value)  # else: not strictly feasible, or not numbers
+    factor, term_factor, value = _evaluated(problem, term, root, problem.start)
+    interior = _finite(factor, term_factor, value)  # else: not strictly feasible, or not numbers
     start = _Iterate(
         x=problem.start,
         factor=factor,
@@ -254,12 +241,26 @@ def _minimize(problem: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
         stalled=~(interior & space.held),  # not held: the cost falls for ever
     )
     end = jax.lax.while_loop(unfinished, advance, start)
-    gap = jnp.maximum(end.value - end.bound, 0.0)
-    return LMISolution(end.x, end.value, gap, end.dual, end.steps, good(end))
+    status = jnp.where(good(end), Status.OPTIMAL.value, Status.STALLED.value)
+    status = jnp.where(jnp.isfinite(end.value), status, Status.INVALID.value).astype(jnp.int32)
+    lower = jnp.minimum(end.bound, end.value)
+    return LMISolution(status, end.x, end.value, lower, end.dual, end.steps)
+
+
+def _evaluated(problem: LMIProblem, term: LogDetTerm, root: Array, x: Array) -> tuple[Array, Array, Array]:
+    """The Cholesky factors of Q(x) and B(x), not finite outside the domain, and the cost at x."""
+    factor, term_factor = jnp.linalg.cholesky(problem.Q(x)), jnp.linalg.cholesky(term.B(x))
+    quadratic = problem.cost @ x + jnp.sum((root @ x) ** 2) / 2
+    log_det = jnp.sum(jnp.log(jnp.diagonal(term_factor)))
+    return factor, term_factor, quadratic - 2 * term.weight * log_det
+
+
+def _finite(*arrays: Array) -> Array:
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(array)) for array in arrays]))
 
 
 @eqx.filter_jit
-def lmi_minimize(problem: LMIProblem, tolerance: float = 1e-8, max_steps: int = MAX_STEPS) -> LMISolution:
+def lmi_minimize(problem: LMIProblem, *, tolerance: float = 1e-8, max_steps: int = MAX_STEPS) -> LMISolution:
     """``min h(x)  subject to  Q_0 + sum_i x_i Q_i >= 0`` by Newton's method on ``t h(x) - log det Q(x)``.
 
     h is linear or convex quadratic, less an optional multiple of log det B(x): see ``LMIProblem``. A log-det
@@ -267,10 +268,10 @@ def lmi_minimize(problem: LMIProblem, tolerance: float = 1e-8, max_steps: int = 
     det, which is convex (erratum 2), and it needs a strictly feasible ``problem.start``; ``lmi_feasibility`` finds
     one. Leading batch axes, ``jax.vmap`` and ``jax.jit`` all work.
 
-    The gap is that of a dual point, not an estimate; it is driven to ``tolerance * max(1, |value|)``, no
-    lower than the dtype allows. Where it gets stuck before, ``converged`` is False and x is the last point. A
-    start that is not strictly feasible and an H that is not positive semidefinite give value NaN. Wrong shapes raise
-    ValueError.
+    ``lower`` is the value of a dual point, not an estimate; the gap is driven to ``tolerance * max(1, |upper|)``, no
+    lower than the dtype allows: OPTIMAL. Where it gets stuck before, the status is STALLED and x is the last point. A
+    start that is not strictly feasible and an H that is not positive semidefinite are INVALID, with ``upper`` NaN.
+    Wrong shapes raise ValueError.
     """
     check_shapes(problem)
     goal = gap_goal(tolerance, problem.cost.dtype)

@@ -3,13 +3,17 @@ feasibility); the semidefinite program in dual form (Definition 6). The method i
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
-from ..core import Array, Bool, Float, rounding_constant, unit_roundoff
+from ..core import Answer, Array, Float, Int, Status, rounding_constant, unit_roundoff
 from .barrier import gap_goal, lmi_minimize, minimize
-from .problem import LMIProblem, expect_shape, over_batch
+from .problem import LMIProblem, bracket_words, expect_shape, over_batch
 
 __all__ = [
     "LMIFeasibility",
@@ -25,10 +29,10 @@ __all__ = [
 
 
 def second_order_cone_lmi(
-    A: Float[Array, "*batch a N"],
-    b: Float[Array, "*batch a"],
-    c: Float[Array, "*batch N"],
-    d: Float[Array, "*batch"],
+    A: Float[ArrayLike, "*batch a N"],
+    b: Float[ArrayLike, "*batch a"],
+    c: Float[ArrayLike, "*batch N"],
+    d: Float[ArrayLike, "*batch"],
 ) -> tuple[Float[Array, "*batch q q"], Float[Array, "*batch N q q"]]:
     """``|A x + b| <= c.x + d  iff  [[(c.x + d) I, A x + b], [(A x + b)^T, c.x + d]] >= 0`` (11.11)-(11.12).
 
@@ -55,35 +59,44 @@ def second_order_cone_lmi(
 # The LMI feasibility problem (Definition 4) ------------------------------------------------------------
 
 
-class LMIFeasibility(eqx.Module):
-    """Answer to: is there an x with Q(x) > 0, or at least with Q(x) >= 0? One of three, and each a proof:
+class LMIFeasibility(Answer):
+    """``lower <= s* <= upper``: is there an x with Q(x) > 0, or at least with Q(x) >= 0?
 
-    feasible    (*batch)        Q(x) > 0 at ``x``
-    infeasible  (*batch)        no x with Q(x) >= 0: ``certificate`` proves it as far as ``reach``
-    edge        (*batch)        neither, and s* <= tolerance: no Q(x) > 0 of that depth; Q(x) >= 0 remains open
-
-    x            (*batch, N)     strictly feasible where ``feasible``
-    depth        (*batch)        a lower bound on the normalised depth s*; s* > 0 iff the strict LMI has a solution
-    gap          (*batch)        s* lies in [depth, depth + gap]
-    certificate  (*batch, q, q)  Z >= 0 with tr Z = 1, and where ``infeasible`` ``tr(Q_i Z) = 0``, ``tr(Q_0 Z) < 0``
+    status       (*batch) int32, a ``Status``: FEASIBLE, Q(x) > 0 at ``x``; INFEASIBLE, no x with Q(x) >= 0:
+                 ``certificate`` proves it as far as ``reach``; MARGINAL, neither, and s* <= tolerance: no Q(x) > 0 of
+                 that depth, Q(x) >= 0 remains open; UNDECIDED; INVALID
+    x            (*batch, N)     strictly feasible where FEASIBLE
+    lower, upper (*batch)        bounds of the normalised depth s*; s* > 0 iff the strict LMI has a solution
+    certificate  (*batch, q, q)  Z >= 0 with tr Z = 1, and where INFEASIBLE ``tr(Q_i Z) = 0``, ``tr(Q_0 Z) < 0``
     reach        (*batch)        Z excludes every x with ``|x_i| |Q_i| < reach |Q_0|`` as a vector, no unit; 0: none
-
-    All three are False where the numbers are not finite or the solver stopped early.
     """
 
+    status: Int[Array, "*batch"]
     x: Float[Array, "*batch N"]
-    depth: Float[Array, "*batch"]
-    gap: Float[Array, "*batch"]
-    feasible: Bool[Array, "*batch"]
-    infeasible: Bool[Array, "*batch"]
-    edge: Bool[Array, "*batch"]
+    lower: Float[Array, "*batch"]
+    upper: Float[Array, "*batch"]
     certificate: Float[Array, "*batch q q"]
     reach: Float[Array, "*batch"]
+
+    SENTENCES: ClassVar[Mapping[Status, str]] = {
+        Status.FEASIBLE: "Feasible: the matrix is positive definite at x.",
+        Status.INFEASIBLE: "Infeasible: the matrix is positive semidefinite nowhere in reach of the certificate.",
+        Status.MARGINAL: "Marginal: the matrix is positive definite nowhere by more than the tolerance; whether it is "
+        "positive semidefinite somewhere remains open.",
+        Status.INVALID: "Invalid: an entry of the matrices is not finite.",
+    }
+
+    def values(self, index: int | tuple[int, ...] = ()) -> str:
+        """The bracket of one lane's depth in words."""
+        return bracket_words("Depth", self.lower, self.upper, index)
 
 
 @eqx.filter_jit
 def lmi_feasibility(
-    constant: Float[Array, "*batch q q"], matrices: Float[Array, "*batch N q q"], tolerance: float = 1e-8
+    constant: Float[ArrayLike, "*batch q q"],
+    matrices: Float[ArrayLike, "*batch N q q"],
+    *,
+    tolerance: float = 1e-8,
 ) -> LMIFeasibility:
     """``s* = max s  subject to  x_0 Q_0 + sum_i x_i Q_i >= s I,  x_0 >= s,  |(x_0, x)| <= 1``: strictly feasible
     iff s* > 0.
@@ -94,10 +107,11 @@ def lmi_feasibility(
 
     The multiplier Z of the matrix block answers the rest. ``Z >= 0`` with ``tr(Q_i Z) = 0`` and ``tr(Q_0 Z) < 0``
     makes ``tr(Q(x) Z) < 0`` for every x, so Q(x) >= 0 has no solution. In floating point the traces are zero up to
-    some rho, and Z excludes every x with ``|x| < -tr(Q_0 Z) / rho``; the answer is ``infeasible`` where this reach is
+    some rho, and Z excludes every x with ``|x| < -tr(Q_0 Z) / rho``; the answer is INFEASIBLE where this reach is
     at least 1 / tolerance. An LMI that has solutions only as x grows without bound, or none but almost (``[[x, 1],
-    [1, 0]]``), is at the edge. Wrong shapes raise ValueError.
+    [1, 0]]``), is MARGINAL. Wrong shapes raise ValueError.
     """
+    constant, matrices = jnp.asarray(constant), jnp.asarray(matrices)
     N, q = matrices.shape[-3], constant.shape[-1]
     expect_shape(constant.shape[-2:] == (q, q), "constant", "(*batch, q, q)", constant)
     expect_shape(matrices.shape[-3:] == (N, q, q), "matrices", f"(*batch, N, {q}, {q})", matrices)
@@ -134,7 +148,7 @@ def feasibility(constant: Array, matrices: Array, goal: Array) -> LMIFeasibility
     down = jnp.zeros(N + 2, dtype).at[-1].set(-1.0)
     end = minimize(LMIProblem(down, centre, blocks, down), goal)
 
-    depth = -end.value
+    depth = -end.upper
     rounding = rounding_constant() * q * unit_roundoff(dtype)
     feasible = depth > rounding
     Z = end.dual[:q, :q]
@@ -144,44 +158,63 @@ def feasibility(constant: Array, matrices: Array, goal: Array) -> LMIFeasibility
     leak = jnp.sqrt(jnp.sum(traces[1:] ** 2)) + rounding
     reach = jnp.maximum(-traces[0] - rounding, 0.0) / leak
     infeasible = ~feasible & (reach * goal >= 1)
-    edge = ~feasible & ~infeasible & (depth + end.gap <= goal)
+    finite = jnp.all(jnp.isfinite(constant)) & jnp.all(jnp.isfinite(matrices))
+    status = jnp.where(-end.lower <= goal, Status.MARGINAL.value, Status.UNDECIDED.value)
+    status = jnp.where(infeasible, Status.INFEASIBLE.value, status)
+    status = jnp.where(feasible, Status.FEASIBLE.value, status)
+    status = jnp.where(finite, status, Status.INVALID.value).astype(jnp.int32)
     x = end.x[1:-1] / end.x[0] * sizes[0] / sizes[1:]
-    return LMIFeasibility(x, depth, end.gap, feasible, infeasible, edge, Z, reach)
+    return LMIFeasibility(status, x, depth, -end.lower, Z, reach)
 
 
 # The semidefinite program in dual form (Definition 6) --------------------------------------------------
 
 
-class SDPSolution(eqx.Module):
-    """A primal and a dual point of an SDP; the optimum lies in [bound, value].
+class SDPSolution(Answer):
+    """``lower <= min u.x <= upper``: a primal and a dual point of an SDP.
 
+    status     (*batch) int32, a ``Status``: OPTIMAL where ``upper - lower <= tolerance * max(1, |upper|)``; STALLED,
+               the point is feasible but the gap did not close, as when u.x is unbounded; INFEASIBLE; MARGINAL, no
+               strictly feasible start; UNDECIDED; INVALID
     x          (*batch, N)     strictly feasible; NaN where no strictly feasible point was found
-    value      (*batch)        u.x; inf where infeasible, NaN at the edge of feasibility
-    Z          (*batch, q, q)  Z >= 0 with ``tr(S_i Z) = u_i``; where infeasible, the certificate: ``tr(S_i Z) = 0``,
+    upper      (*batch)        u.x; infinite where INFEASIBLE, NaN where there is no x
+    lower      (*batch)        ``-tr(S_0 Z)``: no feasible x costs less; -infinite where no dual point was found
+    Z          (*batch, q, q)  Z >= 0 with ``tr(S_i Z) = u_i``; where INFEASIBLE, the certificate: ``tr(S_i Z) = 0``,
                                ``tr(S_0 Z) < 0``
-    gap        (*batch)        value - bound >= 0; inf where no dual point was found, as when u.x is unbounded
-    converged  (*batch)        whether the gap met ``tolerance * max(1, |value|)``
-    feasibility                the answer of phase one
+    feasibility                the answer of phase one, (*batch)
     """
 
+    status: Int[Array, "*batch"]
     x: Float[Array, "*batch N"]
-    value: Float[Array, "*batch"]
+    upper: Float[Array, "*batch"]
+    lower: Float[Array, "*batch"]
     Z: Float[Array, "*batch q q"]
-    gap: Float[Array, "*batch"]
-    converged: Bool[Array, "*batch"]
     feasibility: LMIFeasibility
 
+    SENTENCES: ClassVar[Mapping[Status, str]] = {
+        **LMIFeasibility.SENTENCES,
+        Status.STALLED: "Stalled: the point is strictly feasible; rounding or a cost without a lower bound ended the "
+        "method before its gap.",
+        Status.INVALID: "Invalid: a number is not finite.",
+    }
+
     @property
-    def bound(self) -> Float[Array, "*batch"]:
-        """``-tr(S_0 Z)``: no feasible x costs less."""
-        return jnp.where(jnp.isinf(self.value), self.value, self.value - self.gap)
+    def gap(self) -> Float[Array, "*batch"]:
+        """``upper - lower >= 0``: no feasible x is cheaper by more; 0 where INFEASIBLE."""
+        same = self.upper == self.lower  # both may be infinite
+        return jnp.where(same, jnp.zeros_like(self.upper), self.upper - self.lower)
+
+    def values(self, index: int | tuple[int, ...] = ()) -> str:
+        """The bracket of one lane's cost in words."""
+        return bracket_words("Cost", self.lower, self.upper, index)
 
 
 @eqx.filter_jit
 def sdp_minimize(
-    u: Float[Array, "*batch N"],
-    constant: Float[Array, "*batch q q"],
-    matrices: Float[Array, "*batch N q q"],
+    u: Float[ArrayLike, "*batch N"],
+    constant: Float[ArrayLike, "*batch q q"],
+    matrices: Float[ArrayLike, "*batch N q q"],
+    *,
     tolerance: float = 1e-8,
 ) -> SDPSolution:
     """``min u.x  subject to  S_0 + sum_i x_i S_i >= 0``, with ``max -tr(S_0 Z)`` s.t. ``tr(S_i Z) = u_i, Z >= 0``.
@@ -190,19 +223,22 @@ def sdp_minimize(
     symmetric matrices (erratum 3: they need not be positive semidefinite). ``lmi_feasibility`` finds the start;
     ``lmi_minimize`` takes it from there. Wrong shapes raise ValueError.
     """
+    u, constant, matrices = (jnp.asarray(x) for x in (u, constant, matrices))
     N, q = u.shape[-1], constant.shape[-1]
     expect_shape(constant.shape[-2:] == (q, q), "constant", "(*batch, q, q)", constant)
     expect_shape(matrices.shape[-3:] == (N, q, q), "matrices", f"(*batch, {N}, {q}, {q})", matrices)
     phase = lmi_feasibility(constant, matrices, tolerance=tolerance)
-    start = jnp.where(phase.feasible[..., None], phase.x, jnp.nan)
+    feasible = phase.status == Status.FEASIBLE.value
+    start = jnp.where(feasible[..., None], phase.x, jnp.nan)
     end = lmi_minimize(LMIProblem(u, constant, matrices, start), tolerance=tolerance)
-    infeasible = phase.infeasible
-    batch = end.value.shape
+    batch = end.batch_shape
+    phase = jax.tree.map(lambda x: jnp.broadcast_to(x, (*batch, *x.shape[feasible.ndim :])), phase)
+    infeasible = phase.status == Status.INFEASIBLE.value
     return SDPSolution(
+        status=jnp.where(feasible, end.status, phase.status),
         x=end.x,
-        value=jnp.where(infeasible, jnp.inf, end.value),
-        Z=jnp.where(jnp.broadcast_to(infeasible, batch)[..., None, None], phase.certificate, end.dual),
-        gap=jnp.where(infeasible, 0.0, end.gap),
-        converged=end.converged,
+        upper=jnp.where(infeasible, jnp.inf, end.upper),
+        lower=jnp.where(infeasible, jnp.inf, end.lower),
+        Z=jnp.where(infeasible[..., None, None], phase.certificate, end.dual),
         feasibility=phase,
     )

@@ -8,49 +8,67 @@ block, and a log-det barrier method does the rest.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
-from ..contacts import Grasp, grasp_map, length_scale, null_space
-from ..core import Array, Bool, Float, rank_tolerance, wrench_dimension
+from ..contacts import Grasp, TorqueLimits, grasp_map, length_scale, null_space
+from ..core import Answer, Array, Float, Int, Status, rank_tolerance, wrench_dimension
 from ..forces import Criterion
 from .barrier import gap_goal, minimize
 from .feasibility import feasibility
 from .friction import friction_lmi, is_grasp
-from .problem import LMIProblem, LogDetTerm
+from .problem import LMIProblem, LogDetTerm, bracket_words
 
 __all__ = ["LMIForces", "lmi_forces"]
 
 
-class LMIForces(eqx.Module):
-    """Contact forces and how far from optimal they can be: the optimal cost lies in [bound, cost].
+class LMIForces(Answer):
+    """``lower <= min h <= upper``: contact forces and how far from optimal they can be.
 
-    feasible  (*batch)       a strictly feasible force was found
-    cost      (*batch)       the criterion at ``force``; inf where the load is proved to have no feasible force, NaN
-                             where neither was shown (the edge) and where the numbers are no problem
-    bound     (*batch)       no feasible force costs less
-    force     (*batch, k n)  in N (torques N m), chapter's component order; NaN where none was found
+    status  (*batch) int32, a ``Status``: OPTIMAL; STALLED, a strictly feasible force was found but the gap did not
+            close; INFEASIBLE, the load is proved to have no feasible force; MARGINAL and UNDECIDED, neither was shown;
+            INVALID
+    force   (*batch, k n)  in N (torques N m), chapter's component order; NaN where none was found
+    upper   (*batch)       the criterion at ``force``; infinite where INFEASIBLE, NaN where there is no force
+    lower   (*batch)       no feasible force costs less
     """
 
-    feasible: Bool[Array, "*batch"]
-    cost: Float[Array, "*batch"]
-    bound: Float[Array, "*batch"]
+    status: Int[Array, "*batch"]
     force: Float[Array, "*batch kn"]
+    upper: Float[Array, "*batch"]
+    lower: Float[Array, "*batch"]
+
+    SENTENCES: ClassVar[Mapping[Status, str]] = {
+        Status.OPTIMAL: "Optimal: the forces lie strictly inside every cone and limit, and the bound proves the cost.",
+        Status.INFEASIBLE: "Infeasible: no admissible forces balance the load, and the multipliers prove it.",
+        Status.MARGINAL: "Marginal: no forces lie inside cones and limits by more than the tolerance.",
+        Status.INVALID: "Invalid: the numbers are not a grasp with a load, a criterion and limits.",
+    }
 
     @property
     def gap(self) -> Float[Array, "*batch"]:
-        """``cost - bound``; 0 where infeasible."""
-        return jnp.where(jnp.isinf(self.cost), 0.0, self.cost - self.bound)
+        """``upper - lower``: no feasible force is cheaper by more; 0 where INFEASIBLE."""
+        return jnp.where(jnp.isinf(self.upper), 0.0, self.upper - self.lower)
+
+    def values(self, index: int | tuple[int, ...] = ()) -> str:
+        """The bracket of one lane's cost in words."""
+        return bracket_words("Cost", self.lower, self.upper, index)
 
 
 def lmi_forces(
     grasp: Grasp,
-    wrench: Float[Array, "*batch m"],
+    wrench: Float[ArrayLike, "*batch m"],
+    *,
     criterion: Criterion,
-    max_normal=None,
-    torque_limits=None,
+    max_normal: Float[ArrayLike, "*batch k"] | None = None,
+    torque_limits: TorqueLimits
+    | tuple[Float[ArrayLike, "*batch kn q"], Float[ArrayLike, "*batch q"]]
+    | None = None,
     tolerance: float = 1e-8,
 ) -> LMIForces:
     """``min h(f)  subject to  P(f) >= 0,  G f + wrench = 0,  f_n <= max_normal,  |J^T f| <= tau_max`` (Definition 5).
@@ -58,7 +76,8 @@ def lmi_forces(
     wrench         (*batch, *loads, m), (m,) for all grasps, or any leading axes for a single grasp; N and N m
     criterion      Gentlest(), Robust(), SmallestSum(), SumOfSquares(), LeastNorm(): h
     max_normal     a number or what broadcasts to (*batch, k), in N; optional
-    torque_limits  (J, tau_max): J (*batch, k n, q) or (k n, q), tau_max (*batch, q) or (q,) in N m; optional
+    torque_limits  (J, tau_max): J (*batch, k n, q) or (k n, q), tau_max (*batch, q) or (q,) in N m, or a
+                   ``TorqueLimits``, whose J may be in body or world axes; optional
 
     An LMI feasibility problem finds the start; ``lmi_minimize`` takes it from there to a gap of
     ``tolerance * max(1, |h|)`` in units of the load. A second road: for small problems, one after another. Wrong
@@ -72,6 +91,8 @@ def lmi_forces(
     if max_normal is not None:
         limit = _broadcast(max_normal, (*batch, grasp.contacts), "max_normal", dtype)
     torques = None
+    if isinstance(torque_limits, TorqueLimits):
+        torque_limits = torque_limits.in_contact_axes(grasp)
     if torque_limits is not None:
         J, largest = torque_limits
         J = jnp.asarray(J)
@@ -157,14 +178,16 @@ def _optimize(grasp: Grasp, criterion: Criterion, limit, torques, wrench: Array,
 
     force = reduced.size * reduced.force(end.x[: reduced.V.shape[1]])
     valid = is_grasp(grasp) & jnp.all(jnp.isfinite(wrench))
-    feasible = valid & phase.feasible & (reduced.rest <= goal) & jnp.isfinite(end.value)
-    hopeless = valid & (phase.infeasible | (reduced.rest > goal))
-    without = jnp.where(hopeless, jnp.inf, jnp.nan)
+    status = jnp.where(phase.status == Status.FEASIBLE.value, end.status, phase.status)
+    status = jnp.where(reduced.rest > goal, Status.INFEASIBLE.value, status)
+    status = jnp.where(valid, status, Status.INVALID.value).astype(jnp.int32)
+    found = (status == Status.OPTIMAL.value) | (status == Status.STALLED.value)
+    without = jnp.where(status == Status.INFEASIBLE.value, jnp.inf, jnp.nan)
     return LMIForces(
-        feasible=feasible,
-        cost=jnp.where(feasible, criterion.cost(grasp, force), without),
-        bound=jnp.where(feasible, scale * end.bound + offset, without),
-        force=jnp.where(feasible, force, jnp.nan),
+        status=status,
+        force=jnp.where(found, force, jnp.nan),
+        upper=jnp.where(found, criterion.cost(grasp, force), without),
+        lower=jnp.where(found, scale * end.lower + offset, without),
     )
 
 

@@ -1,7 +1,7 @@
 """The friction LMI of a grasp, its reduction to Null(G), and the margin by this road (11.9)-(11.17).
 
 The second road to every answer of section 11.2: small and general, for teaching and for checking the
-structured solver. The methods that solve LMIs are in barrier.py and semidefinite.py.
+structured solver. The methods that solve LMIs are in barrier.py and feasibility.py.
 """
 
 from __future__ import annotations
@@ -14,24 +14,9 @@ import jax.numpy as jnp
 from ..contacts import Grasp, null_space
 from ..core import Array, Bool, Float, rank_tolerance
 from .barrier import lmi_minimize
-from .feasibility import LMIFeasibility, SDPSolution, lmi_feasibility, sdp_minimize, second_order_cone_lmi
-from .problem import LMIProblem, LMISolution, LogDetTerm, expect_shape
+from .problem import LMIProblem, expect_shape
 
-__all__ = [
-    "FrictionLMI",
-    "LMIFeasibility",
-    "LMIProblem",
-    "LMISolution",
-    "LogDetTerm",
-    "SDPSolution",
-    "friction_lmi",
-    "lmi_feasibility",
-    "lmi_margin",
-    "lmi_minimize",
-    "margin_lmi",
-    "sdp_minimize",
-    "second_order_cone_lmi",
-]
+__all__ = ["FrictionLMI", "friction_lmi", "is_grasp", "lmi_margin", "margin_lmi"]
 
 
 class FrictionLMI(eqx.Module):
@@ -153,7 +138,7 @@ def is_grasp(grasp: Grasp) -> Bool[Array, "*batch"]:
 
 
 @eqx.filter_jit
-def lmi_margin(grasp: Grasp, tolerance: float = 1e-8) -> Float[Array, "*batch"]:
+def lmi_margin(grasp: Grasp, *, tolerance: float = 1e-8) -> Float[Array, "*batch"]:
     """``t* = max t  subject to  G f = 0,  f_n,i - psi_i(f_i) >= t,  sum_i f_n,i = k``: the margin,
     dimensionless.
 
@@ -162,5 +147,5 @@ def lmi_margin(grasp: Grasp, tolerance: float = 1e-8) -> Float[Array, "*batch"]:
     of t*; -inf where no internal force has ``sum f_n != 0``; NaN where the numbers are not a grasp.
     """
     problem, squeezes = _margin_problem(grasp)
-    margin = -lmi_minimize(problem, tolerance=tolerance).value
+    margin = -lmi_minimize(problem, tolerance=tolerance).upper
     return jnp.where(is_grasp(grasp), jnp.where(squeezes, margin, -jnp.inf), jnp.nan)

@@ -6,13 +6,25 @@ matrices, and their size q has nothing to do with the number N of variables. Not
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from ..core import Array, Bool, Float, Int
+from ..core import Answer, Array, Float, Int, Status
 
-__all__ = ["LMIProblem", "LMISolution", "LogDetTerm", "check_shapes", "expect_shape", "over_batch"]
+__all__ = [
+    "LMIProblem",
+    "LMISolution",
+    "LogDetTerm",
+    "bracket_words",
+    "check_shapes",
+    "expect_shape",
+    "over_batch",
+]
 
 
 class LogDetTerm(eqx.Module):
@@ -57,30 +69,49 @@ class LMIProblem(eqx.Module):
         return self.constant + jnp.einsum("...i,...iab->...ab", x, self.matrices)
 
 
-class LMISolution(eqx.Module):
-    """A strictly feasible point and how far from optimal it can be: the optimum lies in [bound, value].
+class LMISolution(Answer):
+    """``lower <= min h <= upper``: a strictly feasible point and how far from optimal it can be.
 
+    status      (*batch) int32, a ``Status``: OPTIMAL where ``upper - lower <= tolerance * max(1, |upper|)``, else
+                STALLED, with the last point; INVALID where there is no start
     x           (*batch, N)     strictly feasible
-    value       (*batch)        its cost
-    gap         (*batch)        value - bound; infinite before the first dual point
-    dual        (*batch, q, q)  Z >= 0, the multiplier of Q(x) >= 0 that proves the bound; 0 before
+    upper       (*batch)        its cost; NaN where INVALID
+    lower       (*batch)        no feasible x costs less; -infinite before the first dual point
+    dual        (*batch, q, q)  Z >= 0, the multiplier of Q(x) >= 0 that proves ``lower``; 0 before
     iterations  (*batch)        Newton steps, int32
-    converged   (*batch)        whether the gap met ``tolerance * max(1, |value|)``
+
+    For a linear cost ``lower = -tr(Q_0 Z)`` with ``Z >= 0, tr(Q_i Z) = c_i``; with curvature
+    ``-tr(Q_0 Z) - 1/2 y^T H y``, ``tr(Q_i Z) = c_i + (H y)_i`` for some y; a log-det term has a multiplier of its own.
     """
 
+    status: Int[Array, "*batch"]
     x: Float[Array, "*batch N"]
-    value: Float[Array, "*batch"]
-    gap: Float[Array, "*batch"]
+    upper: Float[Array, "*batch"]
+    lower: Float[Array, "*batch"]
     dual: Float[Array, "*batch q q"]
     iterations: Int[Array, "*batch"]
-    converged: Bool[Array, "*batch"]
+
+    SENTENCES: ClassVar[Mapping[Status, str]] = {
+        Status.STALLED: "Stalled: rounding, the budget of steps or a cost without a lower bound ended the method "
+        "before its gap; the last point and the gap reached are given.",
+        Status.INVALID: "Invalid: the start is not strictly feasible, the curvature is not positive semidefinite, or a "
+        "number is not finite.",
+    }
 
     @property
-    def bound(self) -> Float[Array, "*batch"]:
-        """No feasible x costs less. For a linear cost ``-tr(Q_0 Z)`` with ``Z >= 0, tr(Q_i Z) = c_i``; with
-        curvature ``-tr(Q_0 Z) - 1/2 y^T H y``, ``tr(Q_i Z) = c_i + (H y)_i`` for some y; a log-det term has a
-        multiplier of its own."""
-        return self.value - self.gap
+    def gap(self) -> Float[Array, "*batch"]:
+        """``upper - lower``: no feasible point is cheaper by more."""
+        return self.upper - self.lower
+
+    def values(self, index: int | tuple[int, ...] = ()) -> str:
+        """The bracket of one lane's cost in words."""
+        return bracket_words("Cost", self.lower, self.upper, index)
+
+
+def bracket_words(name: str, lower: Array, upper: Array, index: int | tuple[int, ...]) -> str:
+    """``name`` between two numbers; empty where the upper one is no number or infinite."""
+    low, high = np.asarray(lower)[index], np.asarray(upper)[index]
+    return f"{name} between {low:.6g} and {high:.6g}." if np.isfinite(high) else ""
 
 
 # Shapes ------------------------------------------------------------------------------------------------

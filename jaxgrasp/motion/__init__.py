@@ -1,6 +1,6 @@
 """Section 11.4: the grasped body's dynamics, controllability, controllers, and closed loops with MuJoCo."""
 
-from .closed_loop import ClosedLoop, close_loop
+from .closed_loop import ClosedLoop, Simulation, close_loop
 from .computed_torque import ComputedTorque, ContactController, Gains, Reference
 from .controllability import Controllability, controllability, controllability_matrix, gramian
 from .linearization import Linearization, linearize
@@ -29,6 +29,7 @@ __all__ = [
     "Reference",
     "Regulator",
     "RigidBody",
+    "Simulation",
     "acceleration",
     "advance",
     "close_loop",

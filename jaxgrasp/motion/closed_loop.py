@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -17,6 +18,7 @@ from ..core import (
     Array,
     Bool,
     Float,
+    Index,
     Int,
     Status,
     applied,
@@ -28,7 +30,36 @@ from .computed_torque import ContactController, Reference, tracking_error
 from .mujoco import MujocoPlant
 from .rigid_body import BodyState, RigidBody, advance
 
-__all__ = ["ClosedLoop", "close_loop"]
+__all__ = ["ClosedLoop", "Simulation", "close_loop"]
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """``steps`` steps of ``timestep`` s under ``gravity``: how a closed loop is run, and what is kept of it.
+
+    steps     of the loop; the reference and the disturbance may have one entry for each
+    timestep  s
+    gravity   (*batch, d) m/s^2, world axes; None: 9.81 along -z, in the plane along -y
+    plant     a ``mujoco_plant`` of the same body, timestep and gravity; None: the analytic ``advance``
+    record    keep all states and forces
+
+    ValueError where steps or timestep are not positive, and where the plant makes steps of another length.
+    """
+
+    steps: int
+    timestep: float = 0.002
+    gravity: Float[ArrayLike, "*batch d"] | None = None
+    plant: MujocoPlant | None = None
+    record: bool = False
+
+    def __post_init__(self):
+        steps, timestep, plant = self.steps, self.timestep, self.plant
+        if not timestep > 0 or not steps > 0:
+            raise ValueError(f"steps and timestep must be positive, got {steps} and {timestep}")
+        if plant is not None and abs(float(plant.timestep) - timestep) > 1e-6 * timestep:
+            raise ValueError(
+                f"the plant steps {float(plant.timestep):g} s, the loop {timestep:g} s: make them equal"
+            )
 
 
 class ClosedLoop(Answer):
@@ -58,7 +89,7 @@ class ClosedLoop(Answer):
         Status.INVALID: "Invalid: the numbers are not a grasp, a body and a state; no forces are applied.",
     }
 
-    def __getitem__(self, index: Any) -> ClosedLoop:
+    def __getitem__(self, index: Index) -> ClosedLoop:
         """The loops at ``index`` of the batch, all steps of each."""
         if len(self.batch_shape) < 2:
             raise IndexError("a single loop has no batch axis to index")
@@ -77,7 +108,7 @@ class ClosedLoop(Answer):
         """(*batch) bool: some step had no admissible forces for its command, or its forces were projected."""
         return jnp.any(self.status != Status.COMMANDED.value, axis=0)
 
-    def settled(self, position: float, orientation: float) -> Int[Array, "*batch"]:
+    def settled(self, *, position: float, orientation: float) -> Int[Array, "*batch"]:
         """The first step from which both errors stay below ``position`` m and ``orientation`` rad; T if never."""
         out = ~((self.position_error <= position) & (self.orientation_error <= orientation))
         steps = jnp.arange(1, out.shape[0] + 1, dtype=jnp.int32).reshape(-1, *[1] * (out.ndim - 1))
@@ -109,14 +140,17 @@ def _run(setting: _Setting, state: BodyState, reference: Reference, pushes, step
     def step(carry: tuple[BodyState, Array], at: tuple[Any, Any]) -> tuple[Any, Any]:
         now, last = carry
         target = at[0] if moving else reference
-        command = controller.command(grasp, body, now, target, last, gravity)
+        command = controller.command(grasp, body, now, reference=target, last=last, gravity=gravity)
         invalid = ((command.status == Status.INVALID.value) | ~sound)[..., None]
         status = jnp.where(sound, command.status, jnp.int32(Status.INVALID.value))
         command = command._replace(force=jnp.where(invalid, 0.0, command.force), status=status)
         wrench = rotate_wrench(now.orientation, applied(G, command.force))
         if at[1] is not None:
             wrench = wrench + at[1]
-        after = advance(body, now, wrench, timestep, gravity) if plant is None else plant.advance(now, wrench)
+        if plant is None:
+            after = advance(body, now, wrench, timestep=timestep, gravity=gravity)
+        else:
+            after = plant.advance(now, wrench)
         after = jax.tree.map(lambda new, old: jnp.where(invalid, old, new), after, now)
         error = tracking_error(now, target).error
         normal = command.force.reshape(*command.force.shape[:-1], grasp.contacts, -1)[..., index]
@@ -152,29 +186,51 @@ def _laid_out(reference: Reference, batch: tuple[int, ...], steps: int, dtype) -
     return jax.tree.map(lambda x: x.astype(dtype).reshape(steps, *own, x.shape[-1]), reference), True
 
 
+def _wide(
+    grasp: Grasp, body: RigidBody, state: BodyState, batch: tuple[int, ...]
+) -> tuple[RigidBody, BodyState]:
+    """Body and state with the grasp's batch axes and dtype."""
+
+    def wide(x: Array, own: int) -> Array:
+        """Trailing ``own`` axes kept, batch axes in front of them."""
+        return jnp.broadcast_to(x.astype(grasp.dtype), (*batch, *x.shape[x.ndim - own :]))
+
+    try:
+        body = eqx.tree_at(lambda b: (b.mass, b.inertia), body, (wide(body.mass, 0), wide(body.inertia, 2)))
+        return body, jax.tree.map(lambda x: wide(x, 1), state)
+    except ValueError as error:
+        raise ValueError(f"body and state must broadcast to the grasp's batch axes {batch}") from error
+
+
+def _pushes(grasp: Grasp, disturbance: ArrayLike, steps: int) -> Array:
+    """The disturbance ready to be scanned over: (steps, *batch or ones, m)."""
+    batch, m = grasp.batch_shape, wrench_dimension(grasp.dimension)
+    pushes = real_array(disturbance, "disturbance").astype(grasp.dtype)
+    if pushes.shape not in ((steps, m), (steps, *batch, m)):
+        raise ValueError(
+            f"disturbance must have shape ({steps}, {m}) or ({steps}, *batch, {m}), got {pushes.shape}"
+        )
+    return pushes.reshape(steps, *[1] * len(batch), m) if batch and pushes.ndim == 2 else pushes
+
+
 def close_loop(
     grasp: Grasp,
     body: RigidBody,
     *,
     controller: ContactController,
     state: BodyState,
-    steps: int,
-    timestep: float = 0.002,
+    simulation: Simulation,
     reference: Reference | None = None,
     disturbance: Float[ArrayLike, "*lead m"] | None = None,
-    gravity: Float[ArrayLike, "*batch d"] | None = None,
-    plant: MujocoPlant | None = None,
-    record: bool = False,
 ) -> ClosedLoop:
-    """Control, contact forces, motion: ``steps`` steps of ``timestep`` s for all grasps of a batch, in one call.
+    """``M q'' + B + G = G^W f + w`` with f the controller's: control, contact forces, motion, all steps in one call.
 
     grasp, body  batch axes in front; the body's broadcast to the grasp's
     controller   ``ComputedTorque`` or ``Regulator``; it knows neither the disturbance nor the future
     state        where the objects start, (*batch)
+    simulation   a ``Simulation``: steps, timestep, gravity, plant, whether to record
     reference    where they should be: a set point, or one for each step; None: at the origin, not turned
-    disturbance  (steps, m) or (steps, *batch, m): a wrench at the centre of mass, world axes, N and N m
-    plant        a ``mujoco_plant`` of the same body, timestep and gravity; None: the analytic ``advance``
-    record       keep all states and forces
+    disturbance  w, (steps, m) or (steps, *batch, m): a wrench at the centre of mass, world axes, N and N m
 
     Applied forces always lie in their friction cones; ``status`` says for each step whether they are the commanded
     ones. A lane with bad numbers is INVALID and stays where it is. ValueError for wrong shapes, and for gains that
@@ -184,37 +240,17 @@ def close_loop(
         raise ValueError(
             f"controller must be a ComputedTorque or a Regulator, got {type(controller).__name__}"
         )
-    if not timestep > 0 or not steps > 0:
-        raise ValueError(f"steps and timestep must be positive, got {steps} and {timestep}")
+    if not isinstance(simulation, Simulation):
+        raise ValueError(f"simulation must be a jaxgrasp.motion.Simulation, got {type(simulation).__name__}")
     if grasp.dimension != body.dimension or grasp.dimension != state.dimension:
         raise ValueError("grasp, body and state must all be spatial or all planar")
-    controller.check(timestep, grasp.dimension)
-    if plant is not None and abs(float(plant.timestep) - timestep) > 1e-6 * timestep:
-        raise ValueError(
-            f"the plant steps {float(plant.timestep):g} s, the loop {timestep:g} s: make them equal"
-        )
-    batch, m, dtype = grasp.batch_shape, wrench_dimension(grasp.dimension), grasp.dtype
-
-    def wide(x: Array, own: int) -> Array:
-        """Trailing ``own`` axes kept, batch axes in front of them."""
-        return jnp.broadcast_to(x.astype(dtype), (*batch, *x.shape[x.ndim - own :]))
-
-    try:
-        body = eqx.tree_at(lambda b: (b.mass, b.inertia), body, (wide(body.mass, 0), wide(body.inertia, 2)))
-        state = jax.tree.map(lambda x: wide(x, 1), state)
-    except ValueError as error:
-        raise ValueError(f"body and state must broadcast to the grasp's batch axes {batch}") from error
+    controller.check(simulation.timestep, grasp.dimension)
+    batch, dtype, steps = grasp.batch_shape, grasp.dtype, simulation.steps
+    body, state = _wide(grasp, body, state, batch)
     if reference is None:
         reference = Reference.hold(BodyState.at_rest(grasp.dimension, (), dtype))
     reference, moving = _laid_out(reference, batch, steps, dtype)
-    pushes = None
-    if disturbance is not None:
-        pushes = real_array(disturbance, "disturbance").astype(dtype)
-        if pushes.shape not in ((steps, m), (steps, *batch, m)):
-            raise ValueError(
-                f"disturbance must have shape ({steps}, {m}) or ({steps}, *batch, {m}), got {pushes.shape}"
-            )
-        if batch and pushes.ndim == 2:
-            pushes = pushes.reshape(steps, *[1] * len(batch), m)
-    setting = _Setting(grasp, body, controller, gravity, plant)
-    return _run(setting, state, reference, pushes, steps, jnp.asarray(timestep, dtype), record, moving)
+    pushes = None if disturbance is None else _pushes(grasp, disturbance, steps)
+    setting = _Setting(grasp, body, controller, simulation.gravity, simulation.plant)
+    timestep = jnp.asarray(simulation.timestep, dtype)
+    return _run(setting, state, reference, pushes, steps, timestep, simulation.record, moving)

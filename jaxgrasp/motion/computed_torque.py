@@ -9,7 +9,8 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -52,14 +53,14 @@ CLOSE = 1e-6  # forces that miss the commanded wrench by less than this share of
 class Gains(eqx.Module):
     """K_p (1/s^2) and K_v (1/s): numbers, or (m, m) positive definite matrices."""
 
-    stiffness: Array
-    damping: Array
+    stiffness: Float[Array, "*square"]
+    damping: Float[Array, "*square"]
 
-    def __init__(self, stiffness: Any, damping: Any):
+    def __init__(self, stiffness: Float[ArrayLike, "*square"], damping: Float[ArrayLike, "*square"]):
         self.stiffness, self.damping = _gain(stiffness, "stiffness"), _gain(damping, "damping")
 
     @classmethod
-    def of_rate(cls, rate: float, damping_ratio: float = 1.0) -> Gains:
+    def of_rate(cls, rate: float, *, damping_ratio: float = 1.0) -> Gains:
         """``K_p = rate^2, K_v = 2 ratio rate``: errors decay like exp(-ratio rate t); ratio 1 without overshoot."""
         if not rate > 0 or not damping_ratio > 0:
             raise ValueError(f"rate and damping_ratio must be positive, got {rate} and {damping_ratio}")
@@ -85,7 +86,7 @@ class Gains(eqx.Module):
             )
 
 
-def _gain(value: Any, name: str) -> Array:
+def _gain(value: ArrayLike, name: str) -> Array:
     array = jnp.asarray(value, float)
     if isinstance(array, Tracer):
         return array
@@ -115,7 +116,9 @@ class Reference(eqx.Module):
         return cls(state.position, state.orientation, zero, zero)
 
     @classmethod
-    def along(cls, path: Any, times: Any) -> Reference:
+    def along(
+        cls, path: Callable[[Float[Array, ""]], Float[Array, " m"]], times: Float[ArrayLike, " steps"]
+    ) -> Reference:
         """Follow ``path(t)``, a JAX function from s to (translation in m; rotation vector in rad), (m,).
 
         Velocities and accelerations are its exact derivatives.
@@ -192,7 +195,14 @@ class ContactController(eqx.Module):
 
     @abstractmethod
     def command(
-        self, grasp: Grasp, body: RigidBody, state: BodyState, reference: Reference, last: Array, gravity: Any
+        self,
+        grasp: Grasp,
+        body: RigidBody,
+        state: BodyState,
+        *,
+        reference: Reference,
+        last: Float[Array, "*batch kn"],
+        gravity: Float[ArrayLike, "*batch d"] | None,
     ) -> Command:
         """The forces to apply now; ``last`` (*batch, k n) were applied before, and are admissible."""
 
@@ -218,16 +228,17 @@ class ComputedTorque(ContactController):
 
     gains: Gains
     criterion: Criterion
-    max_normal: Array | None
-    torque_limits: tuple[Array, Array] | None
+    max_normal: Float[Array, "*batch k"] | None
+    torque_limits: tuple[Float[Array, "*batch kn q"], Float[Array, "*batch q"]] | None
     tolerance: float = eqx.field(static=True)
 
     def __init__(
         self,
         gains: Gains,
+        *,
         criterion: Criterion | None = None,
-        max_normal: Any = None,
-        torque_limits: tuple[Any, Any] | None = None,
+        max_normal: Float[ArrayLike, "*batch k"] | None = None,
+        torque_limits: tuple[Float[ArrayLike, "*batch kn q"], Float[ArrayLike, "*batch q"]] | None = None,
         tolerance: float = 1e-6,
     ):
         self.gains = gains
@@ -240,12 +251,14 @@ class ComputedTorque(ContactController):
         self.tolerance = tolerance
 
     def check(self, timestep: float, dimension: int) -> None:
+        """ValueError where the gains do not fit the body or steps of ``timestep`` s."""
         self.gains.check(timestep, dimension)
 
     def wrench(
         self,
         body: RigidBody,
         state: BodyState,
+        *,
         reference: Reference,
         gravity: Float[ArrayLike, "*batch d"] | None = None,
     ) -> Float[Array, "*batch m"]:
@@ -264,12 +277,20 @@ class ComputedTorque(ContactController):
             inner = rotate(state.orientation, q_dd[..., d:], inverse=True)
             torque = rotate(state.orientation, applied(body.inertia, inner))
         inertial = jnp.concatenate([body.mass[..., None] * q_dd[..., :d], torque], axis=-1)
-        return inertial + coriolis(body, state) + gravity_term(body, gravity)
+        return inertial + coriolis(body, state) + gravity_term(body, gravity=gravity)
 
     def command(
-        self, grasp: Grasp, body: RigidBody, state: BodyState, reference: Reference, last: Array, gravity: Any
+        self,
+        grasp: Grasp,
+        body: RigidBody,
+        state: BodyState,
+        *,
+        reference: Reference,
+        last: Float[Array, "*batch kn"],
+        gravity: Float[ArrayLike, "*batch d"] | None,
     ) -> Command:
-        world = self.wrench(body, state, reference, gravity)
+        """The optimal forces that produce ``wrench``, or the last ones with the reason why not."""
+        world = self.wrench(body, state, reference=reference, gravity=gravity)
         asked = rotate_wrench(state.orientation, world, inverse=True)
         found = optimize_forces(
             grasp,
@@ -280,7 +301,7 @@ class ComputedTorque(ContactController):
             tolerance=self.tolerance,
         )
         cap = None if self.max_normal is None else self.max_normal.astype(asked.dtype)
-        force = into_cones(grasp, found.force, cap)
+        force = into_cones(grasp, found.force, cap=cap)
         made = applied(grasp_map(grasp), force)
         close = jnp.max(jnp.abs(made - asked), axis=-1) <= CLOSE * jnp.max(jnp.abs(asked), axis=-1)
         return _settled(found.status, force, close, last, asked)

@@ -100,6 +100,7 @@ def controllability_matrix(
 def gramian(
     A: Float[Array, "*batch s s"],
     B: Float[Array, "*batch s n"],
+    *,
     horizon: Float[ArrayLike, "*batch"] = HORIZON,
 ) -> Float[Array, "*batch s s"]:
     """``W = int_0^T e^(A t) B B^T e^(A^T t) dt`` of a grasp's linearisation: exact, because A^4 = 0.

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -22,6 +22,11 @@ from jax.typing import ArrayLike
 from ..contacts import Grasp
 from ..core import Array, Float, applied, rotate, rotation_between, turned
 from .rigid_body import BodyState, RigidBody, gravity_vector, world_grasp_map
+
+if TYPE_CHECKING:
+    import mujoco
+    import trimesh
+    from mujoco import mjx
 
 __all__ = ["MujocoPlant", "mujoco_model", "mujoco_plant", "tangent", "tangent_difference"]
 
@@ -55,10 +60,11 @@ def _words(values: Any) -> str:
 
 def mujoco_model(
     body: RigidBody,
+    *,
     timestep: float = 0.002,
     gravity: Float[ArrayLike, "*batch d"] | None = None,
-    mesh: Any = None,
-) -> Any:
+    mesh: trimesh.Trimesh | None = None,
+) -> mujoco.MjModel:  # pyright: ignore[reportAttributeAccessIssue]
     """A ``mujoco.MjModel`` of one body: mass, inertia, free joint, no contacts; semi-implicit Euler of ``timestep`` s.
 
     mesh  a ``trimesh.Trimesh`` in body axes (origin at the centre of mass, m) to look at; it takes no part in contacts
@@ -76,7 +82,7 @@ def mujoco_model(
     assets, asset = {}, ""
     if mesh is not None:
         asset = '<mesh name="object" file="object.obj" inertia="shell"/>'
-        assets = {"object.obj": mesh.export(file_type="obj").encode()}
+        assets = {"object.obj": str(mesh.export(file_type="obj")).encode()}
     xml = TEMPLATE.format(
         timestep=float(timestep),
         gravity=_words(g),
@@ -114,12 +120,12 @@ class MujocoPlant(eqx.Module):
     template  an ``mjx.Data`` of that model
     """
 
-    model: Any
-    template: Any
+    model: mjx.Model
+    template: mjx.Data
     batch_shape: tuple[int, ...] = eqx.field(static=True)
 
     @property
-    def timestep(self) -> Array:
+    def timestep(self) -> Float[Array, ""]:
         """Seconds of one step."""
         return self.model.opt.timestep
 
@@ -226,7 +232,7 @@ def _principal(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mujoco_plant(
-    body: RigidBody, timestep: float = 0.002, gravity: Float[ArrayLike, "*batch d"] | None = None
+    body: RigidBody, *, timestep: float = 0.002, gravity: Float[ArrayLike, "*batch d"] | None = None
 ) -> MujocoPlant:
     """MJX models of all bodies of a batch, semi-implicit Euler steps of ``timestep`` s, gravity in m/s^2, world axes.
 

@@ -64,14 +64,23 @@ class Regulator(ContactController):
     timestep: float
 
     def check(self, timestep: float, dimension: int) -> None:
+        """ValueError where it was made for steps of another length than ``timestep`` s."""
         if abs(timestep - float(self.timestep)) > 1e-6 * timestep:
             raise ValueError(
                 f"the regulator was made for steps of {float(self.timestep):g} s, not {timestep:g} s: make another"
             )
 
     def command(
-        self, grasp: Grasp, body: RigidBody, state: BodyState, reference: Reference, last: Array, gravity: Any
+        self,
+        grasp: Grasp,
+        body: RigidBody,
+        state: BodyState,
+        *,
+        reference: Reference,
+        last: Float[Array, "*batch kn"],
+        gravity: Float[ArrayLike, "*batch d"] | None,
     ) -> Command:
+        """``f_0 - K x``, each contact's force moved to the nearest one in its cone."""
         d = state.dimension
         at = tracking_error(state, reference)
         away = state.velocity - reference.velocity

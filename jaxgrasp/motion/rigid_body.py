@@ -7,13 +7,13 @@ the plane, both in world axes, m/s and rad/s. Contact forces turn with the body.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.typing import ArrayLike
+from jax.typing import ArrayLike, DTypeLike
 
 from ..contacts import Grasp, grasp_map
 from ..core import (
@@ -30,6 +30,9 @@ from ..core import (
     unit_roundoff,
     wrench_dimension,
 )
+
+if TYPE_CHECKING:
+    import trimesh
 
 __all__ = [
     "BodyState",
@@ -61,7 +64,7 @@ class RigidBody(eqx.Module):
     mass: Float[Array, "*batch"]
     inertia: Float[Array, "*batch t t"]
 
-    def __init__(self, mass: Any, inertia: Any):
+    def __init__(self, mass: Float[ArrayLike, "*batch"], inertia: Float[ArrayLike, "*batch t t"]):
         mass, inertia = real_array(mass, "mass"), real_array(inertia, "inertia")
         if inertia.shape == mass.shape:
             inertia = inertia[..., None, None]
@@ -83,7 +86,9 @@ class RigidBody(eqx.Module):
             _complain(float(self.mass), np.asarray(self.inertia, np.float64), unit_roundoff(dtype))
 
     @classmethod
-    def from_mesh(cls, mesh: Any, density: float | None = None, mass: float | None = None) -> RigidBody:
+    def from_mesh(
+        cls, mesh: trimesh.Trimesh, *, density: float | None = None, mass: float | None = None
+    ) -> RigidBody:
         """The body inside a watertight ``trimesh.Trimesh`` in m, of uniform density (kg/m^3) or of this mass (kg).
 
         Axes are the mesh's; the origin moves to the centre of mass of the volume.
@@ -94,7 +99,7 @@ class RigidBody(eqx.Module):
             raise ValueError(
                 "the mesh encloses no volume: repair it, or give RigidBody(mass, inertia) yourself"
             )
-        scale = density if density is not None else mass / mesh.volume
+        scale = density if density is not None else mass / mesh.volume  # pyright: ignore[reportOptionalOperand]
         return cls(scale * mesh.volume, scale / mesh.density * np.asarray(mesh.moment_inertia))
 
     @property
@@ -108,7 +113,7 @@ class RigidBody(eqx.Module):
         return self.mass.shape
 
     @property
-    def dtype(self):
+    def dtype(self) -> np.dtype:
         """The arrays' common dtype."""
         return self.mass.dtype
 
@@ -193,7 +198,7 @@ class BodyState(eqx.Module):
         return self.position.shape[-1]
 
     @classmethod
-    def at_rest(cls, dimension: int = 3, batch: tuple[int, ...] = (), dtype: Any = float) -> BodyState:
+    def at_rest(cls, dimension: int = 3, batch: tuple[int, ...] = (), dtype: DTypeLike = float) -> BodyState:
         """At the origin, not turned, not moving: the equilibrium configuration of the chapter."""
         dtype = jnp.result_type(dtype)
         turn = identity_orientation(dimension, dtype)
@@ -203,7 +208,9 @@ class BodyState(eqx.Module):
             jnp.zeros((*batch, wrench_dimension(dimension)), dtype),
         )
 
-    def displaced(self, displacement: Float[Array, "*batch m"], velocity: Any = 0.0) -> BodyState:
+    def displaced(
+        self, displacement: Float[Array, "*batch m"], velocity: Float[ArrayLike, "*batch m"] = 0.0
+    ) -> BodyState:
         """Moved by (translation in m; rotation vector in rad), world axes, and ``velocity`` faster."""
         d = self.dimension
         return BodyState(
@@ -213,11 +220,12 @@ class BodyState(eqx.Module):
         )
 
 
-def gravity_vector(gravity: Any, dimension: int, dtype) -> Float[Array, "*batch d"]:
+def gravity_vector(
+    gravity: Float[ArrayLike, "*batch d"] | None, dimension: int, dtype: DTypeLike
+) -> Float[Array, "*batch d"]:
     """Gravity in m/s^2, world axes; None: 9.81 along -z, or -y in the plane."""
-    if gravity is None:
-        gravity = [0.0] * (dimension - 1) + [-STANDARD_GRAVITY]
-    array = real_array(gravity, "gravity")
+    standard = np.array([0.0] * (dimension - 1) + [-STANDARD_GRAVITY])
+    array = real_array(standard if gravity is None else gravity, "gravity")
     if array.ndim < 1 or array.shape[-1] != dimension:
         raise ValueError(
             f"gravity must be a vector of {dimension} numbers in m/s^2, such as "
@@ -255,7 +263,7 @@ def coriolis(body: RigidBody, state: BodyState) -> Float[Array, "*batch m"]:
 
 
 def gravity_term(
-    body: RigidBody, gravity: Float[ArrayLike, "*batch d"] | None = None
+    body: RigidBody, *, gravity: Float[ArrayLike, "*batch d"] | None = None
 ) -> Float[Array, "*batch m"]:
     """``G(q) = m_B g grad h = (-m_B gravity; 0)`` (11.23) in N: what the fingers must hold up."""
     d = body.dimension
@@ -278,6 +286,7 @@ def acceleration(
     body: RigidBody,
     state: BodyState,
     wrench: Float[Array, "*batch m"],
+    *,
     gravity: Float[ArrayLike, "*batch d"] | None = None,
 ) -> Float[Array, "*batch m"]:
     """``q'' = M^-1 (w - B - G)`` (11.21): m/s^2 and rad/s^2, world axes, under ``wrench`` (world axes, N, N m)."""
@@ -298,13 +307,14 @@ def advance(
     body: RigidBody,
     state: BodyState,
     wrench: Float[Array, "*batch m"],
-    timestep: float | Array,
+    *,
+    timestep: float | Float[Array, ""],
     gravity: Float[ArrayLike, "*batch d"] | None = None,
 ) -> BodyState:
     """One semi-implicit Euler step of ``timestep`` s: ``v+ = v + h q''(q, v)``, ``q+ = q moved by h v+``.
 
     The scheme of MuJoCo's default integrator; the rotation is integrated exactly for the new angular velocity.
     """
-    velocity = state.velocity + timestep * acceleration(body, state, wrench, gravity)
+    velocity = state.velocity + timestep * acceleration(body, state, wrench, gravity=gravity)
     moved = BodyState(state.position, state.orientation, velocity)
     return moved.displaced(timestep * velocity)

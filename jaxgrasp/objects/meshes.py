@@ -11,6 +11,7 @@ import gzip
 import hashlib
 import io
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 from trimesh.resolvers import FilePathResolver
 
-from ..core import UserError
+from ..core import Float, UserError
 from .builtin import OBJECTS, make_object
 
 __all__ = ["METRES_PER", "Body", "load_mesh"]
@@ -52,7 +53,9 @@ class Body:
     warnings: tuple[str, ...] = ()
 
 
-def load_mesh(source: str | Path, unit: str = "m", com=None) -> Body:
+def load_mesh(
+    source: str | Path, *, unit: str = "m", com: Float[np.ndarray, " 3"] | Sequence[float] | None = None
+) -> Body:
     """The body ``source`` names: a built-in object, or a mesh file of any kind trimesh reads (also ``.gz``).
 
     unit  m, cm, mm or in: what one unit of the file's numbers is. Never guessed.

@@ -59,7 +59,7 @@ class SurfaceSampler(_Blocks):
     mesh  triangles in m with outward normals; degenerate faces have no area and are never chosen
     """
 
-    def __init__(self, mesh: trimesh.Trimesh, fingers: int, seed: int):
+    def __init__(self, mesh: trimesh.Trimesh, *, fingers: int, seed: int):
         _check(fingers, seed)
         triangles = np.array(mesh.triangles, np.float64)
         edge_1, edge_2 = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
@@ -101,6 +101,7 @@ class SurfaceSampler(_Blocks):
         return points, data[:, 9:], self.face[row]
 
     def block(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and inward normals (BLOCK, fingers, 3) of a block, m, mesh frame."""
         uniform = _generator(self.seed, index).random((3, BLOCK * self.fingers))
         points, normals, _ = self.points(uniform)
         return points.reshape(BLOCK, self.fingers, 3), normals.reshape(BLOCK, self.fingers, 3)
@@ -116,8 +117,8 @@ class AntipodalSampler(_Blocks):
 
     fingers = 2
 
-    def __init__(self, mesh: trimesh.Trimesh, friction: float, seed: int):
-        self.surface = SurfaceSampler(mesh, 1, seed)
+    def __init__(self, mesh: trimesh.Trimesh, *, friction: float, seed: int):
+        self.surface = SurfaceSampler(mesh, fingers=1, seed=seed)
         self.seed, self.friction = seed, friction
         self.caster = RayCaster(mesh.triangles)
         self.inward = np.full((len(mesh.faces), 3), np.nan)
@@ -125,6 +126,7 @@ class AntipodalSampler(_Blocks):
         self.shortest = 1e-6 * float(np.linalg.norm(mesh.extents))
 
     def block(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and inward normals (BLOCK, 2, 3) of a block, m, mesh frame; UserError for an open mesh."""
         generator = _generator(self.seed, index)
         position, normal = np.empty((BLOCK, 2, 3)), np.empty((BLOCK, 2, 3))
         done = 0
@@ -171,7 +173,7 @@ def _check(fingers: int, seed: int) -> None:
 
 
 def geometric_filter(
-    position: np.ndarray, normal: np.ndarray, friction: np.ndarray, active: np.ndarray
+    position: np.ndarray, normal: np.ndarray, *, friction: np.ndarray, active: np.ndarray
 ) -> dict[str, np.ndarray]:
     """For each reason to drop a grasp unsolved, the rows (n,) it concerns; a row has one reason at most."""
     slide = slide_escapes(normal, friction, active)

@@ -1,11 +1,13 @@
 """Contacts moved over a surface by gradients to where the grasp holds best, many starts at once."""
 
 from .objectives import FLOOR, Epsilon, Margin, Objective
-from .place import CANDIDATES, Placement, PlacementProgress, place_contacts
-from .requirements import Apart, EdgeClearance, JawWidth, Requirement
+from .place import Placement, place_contacts
+from .requirements import Apart, Beyond, EdgeClearance, JawWidth, Requirement, Within
+from .search import CANDIDATES, PlacementProgress, Search
 
 __all__ = [
     "Apart",
+    "Beyond",
     "CANDIDATES",
     "EdgeClearance",
     "Epsilon",
@@ -16,5 +18,7 @@ __all__ = [
     "Placement",
     "PlacementProgress",
     "Requirement",
+    "Search",
+    "Within",
     "place_contacts",
 ]

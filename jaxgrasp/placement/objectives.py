@@ -17,9 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import PyTree
 
 from ..contacts import Grasp
-from ..core import Array, Float, wrench_dimension
+from ..core import Array, ArrayLike, Float, wrench_dimension
 from ..quality import NORMS, effort_map, epsilon_quality, facet_normal, signed_supports, torque_lengths
 from ..resistance import wrench_resistance
 
@@ -35,6 +36,8 @@ __all__ = [
     "objective",
 ]
 
+Memory = PyTree[Array]  # (B, ..): what an objective has learnt about each grasp
+
 LESSONS = 4
 FLOOR = -10.0  # margins below it (and -inf) count as it
 
@@ -49,7 +52,7 @@ class Objective(eqx.Module):
 
     interval: ClassVar[int] = 1
 
-    def begin(self, grasp: Grasp) -> Any:
+    def begin(self, grasp: Grasp) -> Memory:
         """The memory of grasps that were not seen before."""
         return ()
 
@@ -57,12 +60,12 @@ class Objective(eqx.Module):
         """What starts are chosen by and climbed first: most measures are flat where a grasp does not hold."""
         return Margin()
 
-    def learn(self, grasp: Grasp, memory: Any) -> Any:
+    def learn(self, grasp: Grasp, memory: Memory) -> Memory:
         """The memory after another look at the grasps as they are now."""
         return memory
 
     @abc.abstractmethod
-    def value(self, grasp: Grasp, memory: Any) -> Float[Array, " B"]:
+    def value(self, grasp: Grasp, memory: Memory) -> Float[Array, " B"]:
         """What is climbed, as far as the memory knows."""
 
     def final(self, grasp: Grasp) -> Float[Array, " B"]:
@@ -70,18 +73,18 @@ class Objective(eqx.Module):
         return self.value(grasp, self.begin(grasp))
 
 
-def look(objective: Objective, grasp: Grasp, memory: Any) -> Any:
+def look(objective: Objective, grasp: Grasp, memory: Memory) -> Memory:
     """``objective.learn``: compiled once for all who learn about as many grasps at a time."""
     numbers, asked = eqx.partition(objective, eqx.is_inexact_array_like)
     return _look(asked, numbers, grasp, memory)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _look(asked: Objective, numbers: Any, grasp: Grasp, memory: Any) -> Any:
+def _look(asked: Objective, numbers: Any, grasp: Grasp, memory: Memory) -> Memory:
     return eqx.combine(numbers, asked).learn(grasp, memory)
 
 
-def lessons(objective: Objective, grasp: Grasp) -> Any:
+def lessons(objective: Objective, grasp: Grasp) -> Memory:
     """The memory of grasps not seen before, after looks enough to choose between them by their ``value``."""
     memory = objective.begin(grasp)
     for _ in range(LESSONS if objective.interval > 1 else 0):
@@ -92,7 +95,8 @@ def lessons(objective: Objective, grasp: Grasp) -> Any:
 class Margin(Objective):
     """t* of ``wrench_resistance``, at least -10, so that grasps without any internal force can be compared."""
 
-    def value(self, grasp: Grasp, memory: Any) -> Float[Array, " B"]:
+    def value(self, grasp: Grasp, memory: Memory) -> Float[Array, " B"]:
+        """``max(t*, -10)``, no unit."""
         return jnp.maximum(wrench_resistance(grasp).margin, FLOOR)
 
 
@@ -101,7 +105,8 @@ class Measure(Objective):
 
     function: Callable[[Grasp], Array] = eqx.field(static=True)
 
-    def value(self, grasp: Grasp, memory: Any) -> Float[Array, " B"]:
+    def value(self, grasp: Grasp, memory: Memory) -> Float[Array, " B"]:
+        """``function(grasp)``."""
         return self.function(grasp)
 
 
@@ -116,9 +121,10 @@ class EpsilonFloor(Objective):
     torque_scale  as for ``Epsilon``
     """
 
-    torque_scale: Any = None
+    torque_scale: Float[ArrayLike, "*batch"] | None = None
 
-    def value(self, grasp: Grasp, memory: Any) -> Float[Array, " B"]:
+    def value(self, grasp: Grasp, memory: Memory) -> Float[Array, " B"]:
+        """``sigma / (sqrt(2) k / t + sqrt(k))``, or t where it is not positive."""
         t = jnp.maximum(wrench_resistance(grasp).margin, FLOOR)
         return _floor(grasp, torque_lengths(grasp, self.torque_scale), t)
 
@@ -167,7 +173,7 @@ class Epsilon(Objective):
     """
 
     norm: str = eqx.field(static=True, default="L1")
-    torque_scale: Any = None
+    torque_scale: Float[ArrayLike, "*batch"] | None = None
     interval: ClassVar[int] = 5
 
     def __check_init__(self):
@@ -175,14 +181,17 @@ class Epsilon(Objective):
             raise ValueError(f"norm must be one of {', '.join(NORMS)}, got {self.norm!r}")
 
     def guide(self) -> Objective:
+        """Its lower bound in closed form."""
         return EpsilonFloor(self.torque_scale)
 
     def begin(self, grasp: Grasp) -> _Bank:
+        """An empty bank of directions."""
         m = wrench_dimension(grasp.dimension)
         count = jnp.zeros(grasp.batch_shape, jnp.int32)
         return _Bank(jnp.zeros((*grasp.batch_shape, BANK, m), grasp.dtype), count)
 
     def learn(self, grasp: Grasp, memory: _Bank) -> _Bank:
+        """The bank with the weakest directions of the grasps as they are now."""
         still: Any = jax.tree.map(lax.stop_gradient, grasp)
         weakest = jnp.argsort(self._supports(still, memory), axis=-1)[:, :WARM]
         warm = jnp.take_along_axis(memory.direction, weakest[..., None], axis=1)
@@ -199,9 +208,11 @@ class Epsilon(Objective):
         return _supports(grasp, self.norm, torque_lengths(grasp, self.torque_scale), memory)
 
     def value(self, grasp: Grasp, memory: _Bank) -> Float[Array, " B"]:
+        """``min h(d)`` over the directions of the bank: never below epsilon."""
         return _smallest(self._supports(grasp, memory))
 
     def final(self, grasp: Grasp) -> Float[Array, " B"]:
+        """The proven upper bound of epsilon, in a bracket of 1 %."""
         return epsilon_quality(grasp, norm=self.norm, torque_scale=self.torque_scale).upper
 
 
@@ -222,12 +233,12 @@ def _smallest(h: Array) -> Array:
     return lax.stop_gradient(least[..., 0] - mean) + mean
 
 
-def objective(given: Any) -> Objective:
+def objective(given: Objective | Callable[[Grasp], Array]) -> Objective:
     """``given`` as an ``Objective``: itself, or a function of grasps as a ``Measure``; ValueError for anything else."""
     if isinstance(given, Objective):
         return given
     if callable(given) and not isinstance(given, type):
         return Measure(cast(Callable[[Grasp], Array], given))
     raise ValueError(
-        f"objective must be a jaxgrasp.objectives.Objective such as Epsilon(), or a function of grasps; got {given!r}"
+        f"objective must be a jaxgrasp.placement.Objective such as Epsilon(), or a function of grasps; got {given!r}"
     )

@@ -20,39 +20,29 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from ..certificates import check
 from ..contacts import ContactModel, Grasp, HardFinger
-from ..core import Array, Status, UserError
+from ..core import Array, Float, Status, UserError
 from ..resistance import WrenchResistance, wrench_resistance
 from ..surfaces import Surface
 from .climb import climb
 from .objectives import FLOOR, Margin, Objective, lessons
 from .objectives import objective as as_objective
 from .requirements import SLACK, Requirement, total_excess
-from .settle import ROUNDS, settle
+from .search import PlacementProgress, Search, expect_count
+from .settle import settle
 
-__all__ = ["CANDIDATES", "Placement", "PlacementProgress", "place_contacts"]
+__all__ = ["Placement", "place_contacts"]
 
-CANDIDATES = 2048  # random grasps a start is the best of
 GROUP = 64  # starts drawn together: memory follows it, not the number of starts
 DRAWS = 64  # rounds of random contacts before a region counts as empty
-ADAM = optax.adam(0.05)  # of the radius a step; one object, hence one compilation
-
-
-class PlacementProgress(NamedTuple):
-    """How far a placement is: what it is doing, starts that are through with it, of how many, the best value so far."""
-
-    phase: str
-    done: int
-    starts: int
-    best: float
+SHOWN = 8  # grasps in the words of a placement
 
 
 @dataclass(frozen=True)
 class Placement:
-    """The best distinct grasps, and what became of every start.
+    """``argmax q`` over contacts on a surface: the best distinct grasps, and what became of every start.
 
     grasp     the grasps found, best first (n of them), positions about the surface's centre in m
     position  (n, k, 3) the same contacts in the surface's own frame
@@ -78,6 +68,24 @@ class Placement:
     end: np.ndarray
     steps: np.ndarray
     excess: np.ndarray
+
+    def __str__(self) -> str:
+        """What became of the starts in a line, then the best grasps, one a line."""
+        count, held = len(self.after), int(np.sum(self.resistant))
+        rose = f"median margin {np.median(self.before):.3g} before, {np.median(self.after):.3g} after"
+        lines = [
+            f"{len(self.value)} distinct grasps of {self.end.shape[1]} contacts from {count} starts; {held} starts "
+            f"ended wrench resistant with a proof; {rose}."
+        ]
+        status = np.asarray(self.verdict.status)
+        for i in range(min(len(self.value), SHOWN)):
+            proof = "proved" if self.proved[i] else "not proved"
+            lines.append(
+                f"{i:4d}  value {self.value[i]:.6g}, start {self.start[i]}, {Status(status[i]).name}, {proof}"
+            )
+        if len(self.value) > SHOWN:
+            lines.append(f"      and {len(self.value) - SHOWN} more")
+        return "\n".join(lines)
 
 
 def _draw(
@@ -122,10 +130,7 @@ class _Task(NamedTuple):
     fingers: int
     model: ContactModel
     requirements: tuple[Requirement, ...]
-    starts: int
-    candidates: int
-    settling: int
-    seed: int
+    search: Search
     tell: Callable[[PlacementProgress], None]
 
     def about_centre(self, position: np.ndarray, normal: np.ndarray) -> Grasp:
@@ -135,20 +140,21 @@ class _Task(NamedTuple):
 def _starts(task: _Task, guide: Objective) -> tuple[np.ndarray, np.ndarray]:
     """Points (S, k, 3), each the best of a few random grasps by its guide, and their margins."""
     points, normals = [], []
-    for group, first in enumerate(range(0, task.starts, GROUP)):
+    starts, candidates = task.search.starts, task.search.candidates
+    for group, first in enumerate(range(0, starts, GROUP)):
         # Every group is drawn whole: a start does not depend on how many there are.
-        count = GROUP * task.candidates
-        seeds = (task.seed, group)
+        count = GROUP * candidates
+        seeds = (task.search.seed, group)
         point, normal = _draw(task.surface, task.fingers, task.requirements, seeds, count)
         grasp = task.about_centre(point, normal)
         value = np.asarray(guide.value(grasp, guide.begin(grasp)))
-        value = np.where(np.isfinite(value), value, -np.inf).reshape(GROUP, task.candidates)
-        row = np.arange(min(GROUP, task.starts - first))
-        chosen = row * task.candidates + value.argmax(axis=1)[row]
+        value = np.where(np.isfinite(value), value, -np.inf).reshape(GROUP, candidates)
+        row = np.arange(min(GROUP, starts - first))
+        chosen = row * candidates + value.argmax(axis=1)[row]
         points.append(point[chosen])
         normals.append(normal[chosen])
         done = first + len(row)
-        task.tell(PlacementProgress("screening", done, task.starts, float(value[row].max())))
+        task.tell(PlacementProgress("screening", done, starts, float(value[row].max())))
     origin = np.concatenate(points)
     verdict = wrench_resistance(task.about_centre(origin, np.concatenate(normals)))
     return origin, np.maximum(np.asarray(verdict.margin), FLOOR)
@@ -161,19 +167,18 @@ class _End(NamedTuple):
     steps: np.ndarray
 
 
-def _climbed(
-    task: _Task, objective: Objective, optimizer: optax.GradientTransformation, origin: np.ndarray, steps: int
-) -> _End:
+def _climbed(task: _Task, objective: Objective, origin: np.ndarray) -> _End:
+    search = task.search
     end = _End(origin.copy(), np.zeros(len(origin), int))
     done, best, phase = 0, -np.inf, type(objective).__name__.lower()
     for ended in climb(
-        task.surface.traced, task.model, objective, optimizer, task.requirements, origin, steps
+        task.surface.traced, task.model, objective, search.optimizer, task.requirements, origin, search.steps
     ):
         for one in ended:
             end.point[one.start], end.steps[one.start] = one.point, one.steps
             best = max(best, one.value)
         done += len(ended)
-        task.tell(PlacementProgress(phase, done, task.starts, best))
+        task.tell(PlacementProgress(phase, done, search.starts, best))
     return end
 
 
@@ -196,18 +201,13 @@ def _distinct(position: np.ndarray, order: np.ndarray, most: int, apart: float) 
 
 def place_contacts(
     surface: Surface,
+    *,
     fingers: int = 3,
     model: ContactModel | None = None,
-    objective: Objective | Callable[[Grasp], Array] | None = None,
-    starts: int = 256,
-    steps: int = 150,
-    optimizer: optax.GradientTransformation | None = None,
+    objective: Objective | Callable[[Grasp], Float[Array, " B"]] | None = None,
     requirements: Sequence[Requirement] = (),
-    candidates: int = CANDIDATES,
-    settling: int = ROUNDS,
+    search: Search | None = None,
     best: int = 16,
-    distinct: float = 0.1,
-    seed: int = 0,
     progress: Callable[[PlacementProgress], None] | None = None,
 ) -> Placement:
     """``max q(grasp)`` over contacts on a surface, by gradients from many random starts; the best distinct grasps.
@@ -215,18 +215,13 @@ def place_contacts(
     surface       where the contacts are (``surfaces.of("mug")``, a mesh, a shape)
     fingers       k, contacts of a grasp
     model         their contact model, by default ``HardFinger(0.5)``: one number each, or one per contact (k,)
-    objective     q: ``objectives.Margin()`` (default), ``objectives.Epsilon(norm, torque_scale)``, or a differentiable
-                  function of a batch of grasps to (B,), such as ``lambda g: -jg.critical_friction(g).factor``. It is
-                  climbed from where the climb of its ``guide`` ended, which is the margin where it names no other:
-                  most measures are flat where a grasp does not hold
-    starts        random starts, each the best of ``candidates`` random grasps by the guide
-    steps         at most, of each climb; a start ends earlier when halving its steps helps no more
-    optimizer     an optax optimiser over contacts (k, 3) in units of the surface's radius, a state for each start; by
-                  default ``optax.adam(0.05)``. Its steps are halved where a start no longer improves
+    objective     q: ``Margin()`` (default), ``Epsilon(norm, torque_scale)``, or a differentiable function of a batch of
+                  grasps to (B,), such as ``lambda g: -jg.critical_friction(g).factor``. It is climbed from where the
+                  climb of its ``guide`` ended, which is the margin where it names no other: most measures are flat
+                  where a grasp does not hold
     requirements  ``Apart``, ``Within``, ``Beyond``, ``EdgeClearance``, ``JawWidth`` or your own ``Requirement``
-    settling      rounds of random moves on a mesh's own triangles at the end, 16 trials of the objective each; 0: none
-    best          grasps to return at most, each ``distinct`` (of the radius) away from every better one
-    seed          the same seed gives the same grasps
+    search        a ``Search``: starts, steps, candidates, settling, what is distinct, optimiser, seed
+    best          grasps to return at most, each distinct from every better one
     progress      called with a ``PlacementProgress`` as starts end
 
     UserError where no contact can meet the requirements; ValueError for wrong arguments. NaN in the objective ends
@@ -236,25 +231,23 @@ def place_contacts(
         raise ValueError(
             f"surface must be a jaxgrasp.surfaces.Surface such as surfaces.of('mug'), got {surface!r}"
         )
-    counts = {"fingers": fingers, "starts": starts, "steps": steps, "candidates": candidates, "best": best}
-    for name, value in counts.items():
-        if not isinstance(value, int | np.integer) or value < 1:
-            raise ValueError(f"{name} must be an integer of 1 or more, got {value!r}")
-    if not isinstance(settling, int | np.integer) or settling < 0:
-        raise ValueError(f"settling must be an integer of 0 or more, got {settling!r}")
+    for name, value in (("fingers", fingers), ("best", best)):
+        expect_count(name, value)
     if not all(isinstance(r, Requirement) for r in requirements):
-        raise ValueError("requirements must be jaxgrasp.requirements such as Apart(0.02)")
+        raise ValueError("requirements must be those of jaxgrasp.placement, such as Apart(0.02)")
+    search = Search() if search is None else search
+    if not isinstance(search, Search):
+        raise ValueError(f"search must be a jaxgrasp.placement.Search, got {search!r}")
     asked = Margin() if objective is None else as_objective(objective)
-    optimizer = ADAM if optimizer is None else optimizer
     model = HardFinger(0.5) if model is None else model
     tell = progress if progress is not None else lambda _: None
-    task = _Task(surface, fingers, model, tuple(requirements), starts, candidates, settling, seed, tell)
+    task = _Task(surface, fingers, model, tuple(requirements), search, tell)
     guide = asked.guide()
     origin, before = _starts(task, guide)
-    ends = [_climbed(task, guide, optimizer, origin, steps)]
+    ends = [_climbed(task, guide, origin)]
     if type(asked) is not type(guide):
-        ends.append(_climbed(task, asked, optimizer, ends[0].point, steps))
-    return _judged(task, asked, origin, before, ends, best, distinct)
+        ends.append(_climbed(task, asked, ends[0].point))
+    return _judged(task, asked, origin, before, ends, best)
 
 
 class _Exact(NamedTuple):
@@ -295,13 +288,14 @@ def _exact(task: _Task, objective: Objective, position: np.ndarray, normal: np.n
 
 def _settled(task: _Task, objective: Objective, exact: _Exact) -> _Exact:
     """Contacts after a while of random moves."""
+    search = task.search
     position, normal, done, best = exact.position.copy(), exact.normal.copy(), 0, -np.inf
     for group in settle(
-        task.surface, task.model, objective, task.requirements, position, normal, task.seed, task.settling
+        task.surface, task.model, objective, task.requirements, position, normal, search.seed, search.settling
     ):
         position[group.start], normal[group.start] = group.position, group.normal
         done, best = done + len(group.start), max(best, group.best)
-        task.tell(PlacementProgress("settling", done, task.starts, best))
+        task.tell(PlacementProgress("settling", done, search.starts, best))
     return _exact(task, objective, position, normal)
 
 
@@ -317,10 +311,10 @@ def _judged(
     before: np.ndarray,
     ends: list[_End],
     best: int,
-    distinct: float,
 ) -> Placement:
     """Exact contacts, verdicts and proofs of all starts; the best distinct ones among those within the requirements."""
-    limit = SLACK * float(task.surface.radius)
+    radius = float(task.surface.radius)
+    limit = SLACK * radius
 
     def better(one: _Exact, other: _Exact) -> _Exact:
         won = one.worth(limit) > other.worth(limit)
@@ -330,11 +324,11 @@ def _judged(
     exact = _exact(task, objective, *task.surface.exact_contact(ends[-1].point))
     for earlier in (*(end.point for end in ends[:-1]), origin):
         exact = better(_exact(task, objective, *task.surface.exact_contact(earlier)), exact)
-    if task.settling and task.surface.faceted:
+    if task.search.settling and task.surface.faceted:
         exact = better(_settled(task, objective, exact), exact)
     order = np.flatnonzero(np.isfinite(exact.value) & (exact.excess <= limit))
     order = order[np.lexsort((-exact.value[order], ~exact.resistant[order]))]
-    chosen = np.array(_distinct(exact.position, order, best, distinct * float(task.surface.radius)), int)
+    chosen = np.array(_distinct(exact.position, order, best, task.search.distinct * radius), int)
     final = np.zeros(0)
     if len(chosen):
         final = np.asarray(objective.final(task.about_centre(exact.position[chosen], exact.normal[chosen])))

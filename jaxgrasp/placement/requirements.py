@@ -25,7 +25,9 @@ class Requirement(eqx.Module):
     """Positions (.., k, 3) in m in the surface's frame, inward normals, and how far they are from what is asked."""
 
     @abc.abstractmethod
-    def excess(self, surface: SmoothSurface, position: Array, normal: Array) -> Float[Array, "*batch"]:
+    def excess(
+        self, surface: SmoothSurface, position: Float[Array, "*batch k 3"], normal: Float[Array, "*batch k 3"]
+    ) -> Float[Array, "*batch"]:
         """``sqrt(sum of squared violations)`` in m; 0 where satisfied."""
 
 
@@ -44,7 +46,10 @@ def _distances(position: Array) -> Array:
 
 
 def total_excess(
-    requirements: Sequence[Requirement], surface: SmoothSurface, position: Array, normal: Array
+    requirements: Sequence[Requirement],
+    surface: SmoothSurface,
+    position: Float[Array, "*batch k 3"],
+    normal: Float[Array, "*batch k 3"],
 ) -> Float[Array, "*batch"]:
     """Root of the sum of squares of all excesses, m; its derivative is 0 where it is."""
     total = jnp.zeros(position.shape[:-2], position.dtype)
@@ -58,7 +63,10 @@ class Apart(Requirement):
 
     distance: float
 
-    def excess(self, surface: SmoothSurface, position: Array, normal: Array) -> Float[Array, "*batch"]:
+    def excess(
+        self, surface: SmoothSurface, position: Float[Array, "*batch k 3"], normal: Float[Array, "*batch k 3"]
+    ) -> Float[Array, "*batch"]:
+        """``(sum over pairs of max(distance - |p_i - p_j|, 0)^2)^(1/2)``, m."""
         if position.shape[-2] < 2:
             return jnp.zeros(position.shape[:-2], position.dtype)
         return _short(self.distance - _distances(position))
@@ -70,7 +78,10 @@ class JawWidth(Requirement):
     most: float
     least: float = 0.0
 
-    def excess(self, surface: SmoothSurface, position: Array, normal: Array) -> Float[Array, "*batch"]:
+    def excess(
+        self, surface: SmoothSurface, position: Float[Array, "*batch k 3"], normal: Float[Array, "*batch k 3"]
+    ) -> Float[Array, "*batch"]:
+        """By how much the jaw would have to open or close, m."""
         width = _distances(position[..., :2, :])
         return _short(jnp.concatenate([width - self.most, self.least - width], axis=-1))
 
@@ -80,7 +91,10 @@ class EdgeClearance(Requirement):
 
     distance: float
 
-    def excess(self, surface: SmoothSurface, position: Array, normal: Array) -> Float[Array, "*batch"]:
+    def excess(
+        self, surface: SmoothSurface, position: Float[Array, "*batch k 3"], normal: Float[Array, "*batch k 3"]
+    ) -> Float[Array, "*batch"]:
+        """``(sum of max(distance - edge_distance(p_i), 0)^2)^(1/2)``, m; 0 where there are no edges."""
         clear = surface.edge_distance(position)
         return _short(jnp.where(jnp.isfinite(clear), self.distance - clear, 0.0))
 
@@ -93,7 +107,10 @@ class Within(Requirement):
 
     inside: Callable[[Array], Array] = eqx.field(static=True)
 
-    def excess(self, surface: SmoothSurface, position: Array, normal: Array) -> Float[Array, "*batch"]:
+    def excess(
+        self, surface: SmoothSurface, position: Float[Array, "*batch k 3"], normal: Float[Array, "*batch k 3"]
+    ) -> Float[Array, "*batch"]:
+        """``(sum of max(-inside(p_i), 0)^2)^(1/2)``, m."""
         return _short(-jnp.vectorize(self.inside, signature="(d)->()")(position))
 
 
@@ -103,6 +120,9 @@ class Beyond(Requirement):
     centre: tuple[float, float, float]
     radius: float
 
-    def excess(self, surface: SmoothSurface, position: Array, normal: Array) -> Float[Array, "*batch"]:
+    def excess(
+        self, surface: SmoothSurface, position: Float[Array, "*batch k 3"], normal: Float[Array, "*batch k 3"]
+    ) -> Float[Array, "*batch"]:
+        """``(sum of max(radius - |p_i - centre|, 0)^2)^(1/2)``, m."""
         away = position - jnp.asarray(self.centre, position.dtype)
         return _short(self.radius - safe_root(jnp.sum(away * away, axis=-1)))

@@ -259,28 +259,16 @@ def epsilon_quality(
     traced = any(isinstance(x, Tracer) for x in jax.tree.leaves((rows, goal)))
     found = _compiled(plan)(rows, goal) if traced else _on_host(plan, rows, goal)
 
-    twist = verdict.escape_twist
-    d = grasp.dimension
-    away = -jnp.concatenate([twist[..., :d], twist[..., d:] * lax.stop_gradient(length)[..., None]], axis=-1)
-    size = jnp.sqrt(jnp.sum(away * away, axis=-1, keepdims=True))
-    first = jnp.zeros_like(away).at[..., 0].set(1.0)
-    away = jnp.where(size > 0, away / jnp.where(size > 0, size, 1.0), first)
+    away = _unresisted(grasp, verdict.escape_twist, lax.stop_gradient(length))
     direction = jnp.where(resistant[..., None], found.direction, away)
     edge = _supports(rows.A, grasp.active, norm, direction)
-    refuted = verdict.status == Status.NOT_RESISTANT.value
-    invalid = verdict.status == Status.INVALID.value
-
-    def final(inside: Array, outside: Array) -> Array:
-        value = jnp.where(resistant, inside, jnp.where(refuted, 0.0, outside))
-        return jnp.where(invalid, jnp.nan, value)
-
-    lower = final(found.lower, jnp.zeros_like(edge))
-    upper = final(found.upper, edge)
+    lower = _bound(verdict.status, found.lower, jnp.zeros_like(edge))
+    upper = _bound(verdict.status, found.upper, edge)
     # d(epsilon) = d . dA f with the touching wrench's d and f held, by the envelope theorem
     moved = jnp.where(resistant[..., None, None, None], A, lax.stop_gradient(A))
     slope = jnp.einsum("...m,...kmn,...kn->...", direction, moved, found.touching)
     change = slope - lax.stop_gradient(slope)
-    nan = jnp.where(invalid, jnp.nan, 0.0)[..., None]
+    nan = jnp.where(verdict.status == Status.INVALID.value, jnp.nan, 0.0)[..., None]
     return EpsilonQuality(
         verdict.status,
         lower + change,
@@ -293,6 +281,22 @@ def epsilon_quality(
         lax.stop_gradient(length),
         norm,
     )
+
+
+def _unresisted(grasp: Grasp, twist: Array, length: Array) -> Array:
+    """Where a grasp is not resistant, the unit direction (F; tau / length) that no force pushes along."""
+    d = grasp.dimension
+    away = -jnp.concatenate([twist[..., :d], twist[..., d:] * length[..., None]], axis=-1)
+    size = jnp.sqrt(jnp.sum(away * away, axis=-1, keepdims=True))
+    first = jnp.zeros_like(away).at[..., 0].set(1.0)
+    return jnp.where(size > 0, away / jnp.where(size > 0, size, 1.0), first)
+
+
+def _bound(status: Array, inside: Array, outside: Array) -> Array:
+    """``inside`` where RESISTANT, 0 where NOT_RESISTANT, NaN where INVALID, else ``outside``."""
+    value = jnp.where(status == Status.NOT_RESISTANT.value, 0.0, outside)
+    value = jnp.where(status == Status.RESISTANT.value, inside, value)
+    return jnp.where(status == Status.INVALID.value, jnp.nan, value)
 
 
 @functools.partial(jax.jit, static_argnames=("norm",))

@@ -16,7 +16,7 @@ from jax import lax
 from jax.typing import ArrayLike
 
 from ..contacts import Grasp, folded_grasp_map, length_scale
-from ..core import Array, Float, safe_root, wrench_dimension
+from ..core import Array, Bool, Float, safe_root, wrench_dimension
 
 __all__ = [
     "NORMS",
@@ -50,7 +50,7 @@ def torque_lengths(
         ) from error
 
 
-def effort_map(grasp: Grasp, length: Array) -> Float[Array, "*batch k m n"]:
+def effort_map(grasp: Grasp, length: Float[Array, "*batch"]) -> Float[Array, "*batch k m n"]:
     """``A_i``: scaled contact forces, normal component first, to wrenches (F; tau / length). Zero where inactive."""
     m, n = wrench_dimension(grasp.dimension), grasp.model.force_size(grasp.dimension)
     rows = jnp.arange(m) < grasp.dimension
@@ -61,7 +61,7 @@ def effort_map(grasp: Grasp, length: Array) -> Float[Array, "*batch k m n"]:
     return blocks[..., order]
 
 
-def scaled(grasp: Grasp, force: Array) -> Float[Array, "*batch k n"]:
+def scaled(grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch k n"]:
     """s with f = (mu, mu, 1, gamma) s, normal component first; 0 where a component does not exist."""
     scale = grasp.model.scaling(grasp.dimension)
     s = force.reshape(*force.shape[:-1], *scale.shape[-2:])
@@ -97,7 +97,12 @@ def support(A: Array, active: Array, norm: str, direction: Array) -> tuple[Array
     return value, jnp.einsum("kmn,kn->m", A, force), force
 
 
-def signed_supports(A: Array, active: Array, norm: str, direction: Array) -> Float[Array, "*batch D"]:
+def signed_supports(
+    A: Float[Array, "*batch k m n"],
+    active: Bool[Array, "*batch k"],
+    norm: str,
+    direction: Float[Array, "*batch D m"],
+) -> Float[Array, "*batch D"]:
     """``h`` of directions (*batch, D, m) for A (*batch, k, m, n); ``max_i h_i < 0`` where no contact pushes along d."""
     v = jnp.einsum("...kmn,...dm->...dkn", A, direction)
     h = v[..., 0] + safe_root(jnp.sum(v[..., 1:] ** 2, axis=-1))

@@ -70,63 +70,86 @@ def weakest_direction(A: Array, norm: str, near: Touch, upper: Array) -> Touch:
     return lax.while_loop(open_guess, try_one, start)[1]
 
 
-def _newton(A: Array, norm: str, near: Touch, upper: Array, core_below: Array, edge: Array) -> Touch:
-    k, m, n = A.shape
-    dtype = A.dtype
-    idle, full, core = _cases(norm, near.forces, core_below, edge)
-    level = jnp.asarray(1.0 if norm == "L1" else 0.0, dtype)
-    size = m + 1 + k * n
-    eye = jnp.eye(n, dtype=dtype)
-    wide = jnp.moveaxis(A, 0, 1).reshape(m, k * n)
+class _System(NamedTuple):
+    """The equations of one guess of cases in the unknowns x = (d, e, s): their residual and its matrix."""
 
-    def tails(d: Array) -> tuple[Array, Array, Array]:
-        v = jnp.einsum("kmn,m->kn", A, d)
+    A: Array  # (k, m, n)
+    level: Array  # 1 (L1), 0 (Linf): h = level e
+    idle: Array  # (k,)
+    full: Array
+    core: Array
+
+    @property
+    def wide(self) -> Array:
+        """[A_1 .. A_k], (m, k n)."""
+        k, m, n = self.A.shape
+        return jnp.moveaxis(self.A, 0, 1).reshape(m, k * n)
+
+    def tails(self, d: Array) -> tuple[Array, Array, Array]:
+        """v = A^T d (k, n), |v_t| (k,) and v_t / |v_t| (k, n - 1)."""
+        v = jnp.einsum("kmn,m->kn", self.A, d)
         tail = jnp.sqrt(jnp.sum(v[:, 1:] ** 2, axis=-1))
         safe = jnp.where(tail > 0, tail, 1.0)
         return v, tail, v[:, 1:] / safe[:, None]
 
-    def system(x: Array) -> tuple[Array, Array]:
+    def __call__(self, x: Array) -> tuple[Array, Array]:
+        """Residual and matrix at x."""
+        A, level, idle, core = self.A, self.level, self.idle, self.core
+        k, m, n = A.shape
         d, e, s = x[:m], x[m], x[m + 1 :].reshape(k, n)
-        v, tail, u = tails(d)
+        v, tail, u = self.tails(d)
         safe = jnp.where(tail > 0, tail, 1.0)
         # First row of a contact: its effort is given, or its h is.
         on_rim = ~core
         value = v[:, 0] + jnp.where(on_rim, tail, 0.0) - level * e
         given = jnp.where(idle, s[:, 0], s[:, 0] - 1)
-        fixed = idle | full
+        fixed = idle | self.full
         first = jnp.where(fixed, given, value)
         slope = A[:, :, 0] + jnp.where(on_rim[:, None], jnp.einsum("kmn,kn->km", A[:, :, 1:], u), 0.0)
         # Other rows: no tail, no tangential velocity, or a tail along it.
         tied = s[:, 1:] - s[:, :1] * u
         rest = jnp.where(idle[:, None], s[:, 1:], jnp.where(core[:, None], v[:, 1:], tied))
-        turn = (jnp.eye(n - 1, dtype=dtype) - u[:, :, None] * u[:, None, :]) / safe[:, None, None]
+        turn = (jnp.eye(n - 1, dtype=A.dtype) - u[:, :, None] * u[:, None, :]) / safe[:, None, None]
         du = jnp.einsum("kab,kmb->kam", turn, A[:, :, 1:])
         by_d = jnp.where(
             idle[:, None, None], 0.0,
             jnp.where(core[:, None, None], jnp.moveaxis(A[:, :, 1:], 1, 2), -s[:, :1, None] * du),
         )  # fmt: skip
         by_d = jnp.concatenate([jnp.where(fixed[:, None], 0.0, slope)[:, None], by_d], axis=1)
-        by_e = jnp.zeros((k, n), dtype).at[:, 0].set(jnp.where(fixed, 0.0, -level))
-        own = jnp.where((idle | ~core)[:, None, None], eye, 0.0)
+        contacts = jnp.concatenate([first[:, None], rest], axis=1).reshape(-1)
+        top = self.wide @ s.reshape(-1) - e * d
+        return jnp.concatenate([top, ((d @ d - 1) / 2)[None], contacts]), self._matrix(x, by_d, u)
+
+    def _matrix(self, x: Array, by_d: Array, u: Array) -> Array:
+        """Rows: the wrench, |d| = 1, the contacts, whose derivatives by d are ``by_d`` (k, n, m)."""
+        (k, m, n), dtype = self.A.shape, self.A.dtype
+        idle, core, fixed = self.idle, self.core, self.idle | self.full
+        d, e = x[:m], x[m]
+        by_e = jnp.zeros((k, n), dtype).at[:, 0].set(jnp.where(fixed, 0.0, -self.level))
+        own = jnp.where((idle | ~core)[:, None, None], jnp.eye(n, dtype=dtype), 0.0)
         own = own.at[:, 1:, 0].add(jnp.where((idle | core)[:, None], 0.0, -u))
         own = own.at[:, 0, 0].set(jnp.where(fixed, 1.0, 0.0))
         by_s = jnp.einsum("kab,kl->kalb", own, jnp.eye(k, dtype=dtype)).reshape(k * n, k * n)
-        matrix = jnp.zeros((size, size), dtype)
+        matrix = jnp.zeros((x.shape[0], x.shape[0]), dtype)
         matrix = matrix.at[:m, :m].set(-e * jnp.eye(m, dtype=dtype)).at[:m, m].set(-d)
-        matrix = matrix.at[:m, m + 1 :].set(wide).at[m, :m].set(d)
+        matrix = matrix.at[:m, m + 1 :].set(self.wide).at[m, :m].set(d)
         matrix = matrix.at[m + 1 :, :m].set(by_d.reshape(k * n, m)).at[m + 1 :, m].set(by_e.reshape(-1))
-        matrix = matrix.at[m + 1 :, m + 1 :].set(by_s)
-        contacts = jnp.concatenate([first[:, None], rest], axis=1).reshape(-1)
-        top = wide @ s.reshape(-1) - e * d
-        return jnp.concatenate([top, ((d @ d - 1) / 2)[None], contacts]), matrix
+        return matrix.at[m + 1 :, m + 1 :].set(by_s)
+
+
+def _newton(A: Array, norm: str, near: Touch, upper: Array, core_below: Array, edge: Array) -> Touch:
+    k, m, n = A.shape
+    dtype = A.dtype
+    level = jnp.asarray(1.0 if norm == "L1" else 0.0, dtype)
+    system = _System(A, level, *_cases(norm, near.forces, core_below, edge))
 
     def step(_: int, x: Array) -> Array:
         residual, matrix = system(x)
         return x - jnp.linalg.solve(matrix, residual)
 
-    start = jnp.concatenate(
-        [near.direction, (near.direction @ (wide @ near.forces.reshape(-1)))[None], near.forces.reshape(-1)]
-    )
+    start = jnp.concatenate([
+        near.direction, (near.direction @ (system.wide @ near.forces.reshape(-1)))[None], near.forces.reshape(-1)
+    ])  # fmt: skip
     x = lax.fori_loop(0, STEPS, step, start)
     residual, _ = system(x)
     d, s = x[:m], x[m + 1 :].reshape(k, n)
@@ -135,7 +158,7 @@ def _newton(A: Array, norm: str, near: Touch, upper: Array, core_below: Array, e
     sound = jnp.all(jnp.isfinite(x)) & jnp.all(jnp.abs(residual) < fine)
     sound = sound & (x[m] <= upper * (1 + fine)) & jnp.all(s[:, 0] >= -fine) & jnp.all(tail <= s[:, 0] + fine)
     # The forces attain h(d) with unit effort: no idle contact would push harder, none pushes beyond its effort.
-    v, tail, _ = tails(d)
+    v, tail, _ = system.tails(d)
     h = v[:, 0] + tail
     value = jnp.max(h) if norm == "L1" else jnp.sum(jnp.maximum(h, 0.0))
     sound = sound & (value <= x[m] * (1 + fine)) & jnp.all(s[:, 0] <= 1 + fine)

@@ -7,9 +7,13 @@ shape operator. Shapes in closed form or by Newton's method; meshes by a spline 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from ..core import Float
 from .gauge import Ellipsoid, Superquadric
 from .mesh import MeshSurface, NearestPoint
 from .rounded import Cylinder, RoundedBox, Sphere
@@ -32,7 +36,13 @@ __all__ = [
 ]
 
 
-def of(source: str | Path | Body, unit: str = "m", com: Any = None, resolution: int = 96) -> MeshSurface:
+def of(
+    source: str | Path | Body,
+    *,
+    unit: str = "m",
+    com: Float[np.ndarray, " 3"] | Sequence[float] | None = None,
+    resolution: int = 96,
+) -> MeshSurface:
     """The surface of a built-in object, a mesh file or a ``Body``, in m and in the file's frame.
 
     unit        m, cm, mm or in: what one unit of the file's numbers is; a body is in metres already
@@ -49,5 +59,5 @@ def of(source: str | Path | Body, unit: str = "m", com: Any = None, resolution: 
             raise ValueError(
                 "a Body has its unit and its centre of mass: give those to jaxgrasp.objects.load_mesh"
             )
-        return MeshSurface.from_body(source, resolution)
-    return MeshSurface.from_body(load_mesh(source, unit, com), resolution)
+        return MeshSurface.from_body(source, resolution=resolution)
+    return MeshSurface.from_body(load_mesh(source, unit=unit, com=com), resolution=resolution)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ..core import Array, Float, contact_frame, cross
+from ..core import Array, ArrayLike, Float, contact_frame, cross
 from .surface import Surface, centre_or_origin, directions, generator, parameter, same_dtype
 
 __all__ = ["Ellipsoid", "Gauge", "Superquadric"]
@@ -53,7 +53,7 @@ class Gauge(Surface):
     semiaxes: eqx.AbstractVar[Array]
 
     @abc.abstractmethod
-    def gauge(self, x: Float[Array, " 3"]) -> Array:
+    def gauge(self, x: Float[Array, " 3"]) -> Float[Array, ""]:
         """F at a point relative to the centre, without a unit: below 1 inside, above outside."""
 
     def _residual(self, x: Array, point: Array) -> Array:
@@ -143,17 +143,17 @@ class Ellipsoid(Gauge):
     semiaxes: Float[Array, " 3"]
     centre: Float[Array, " 3"]
 
-    def __init__(self, semiaxes: Any, centre: Any = None):
+    def __init__(self, semiaxes: Float[ArrayLike, " 3"], centre: Float[ArrayLike, " 3"] | None = None):
         self.semiaxes, self.centre = same_dtype(
             parameter(semiaxes, (3,), "semiaxes"), centre_or_origin(centre)
         )
 
     @property
-    def radius(self) -> Array:
+    def radius(self) -> Float[Array, ""]:
         """The longest semiaxis, m."""
         return jnp.max(self.semiaxes)
 
-    def gauge(self, x: Float[Array, " 3"]) -> Array:
+    def gauge(self, x: Float[Array, " 3"]) -> Float[Array, ""]:
         """``|(x_i / a_i)|``."""
         return jnp.sqrt(jnp.sum((x / self.semiaxes) ** 2) + SOFT**4)
 
@@ -208,7 +208,12 @@ class Superquadric(Gauge):
     exponents: Float[Array, " 2"]
     centre: Float[Array, " 3"]
 
-    def __init__(self, semiaxes: Any, exponents: Any, centre: Any = None):
+    def __init__(
+        self,
+        semiaxes: Float[ArrayLike, " 3"],
+        exponents: Float[ArrayLike, " 2"],
+        centre: Float[ArrayLike, " 3"] | None = None,
+    ):
         self.semiaxes, self.exponents, self.centre = same_dtype(
             parameter(semiaxes, (3,), "semiaxes"),
             parameter(exponents, (2,), "exponents"),
@@ -223,12 +228,12 @@ class Superquadric(Gauge):
                 )
 
     @property
-    def radius(self) -> Array:
+    def radius(self) -> Float[Array, ""]:
         """Largest distance from the centre, m, in closed form."""
         a, b, c = self.semiaxes[0], self.semiaxes[1], self.semiaxes[2]
         return _longest(_longest(a, b, 2 / self.exponents[1]), c, 2 / self.exponents[0])
 
-    def gauge(self, x: Float[Array, " 3"]) -> Array:
+    def gauge(self, x: Float[Array, " 3"]) -> Float[Array, ""]:
         """The left side to the power e1 / 2."""
         u = jnp.sqrt((x / self.semiaxes) ** 2 + SOFT**2)
         return _norm(_norm(u[0], u[1], 2 / self.exponents[1]), u[2], 2 / self.exponents[0])

@@ -8,19 +8,21 @@ point's by curvature times the square of the distance. Outside: ``project_exact`
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ..core import Array, Float, UserError
+from ..core import Array, ArrayLike, Float, UserError
 from .grid import DistanceGrid, distance_grid
 from .nearest import TriangleSearch
 from .surface import SmoothSurface, Surface, generator, unit_or
 from .triangles import Triangles
 
 if TYPE_CHECKING:
+    import trimesh
+
     from ..objects import Body
 
 __all__ = ["GridSurface", "MeshSurface", "NearestPoint"]
@@ -124,7 +126,14 @@ class MeshSurface(Surface):
     lost: float = eqx.field(static=True)
     warnings: tuple[str, ...] = eqx.field(static=True)
 
-    def __init__(self, mesh: Any, resolution: int = 96, centre: Any = None, crease: float = np.pi / 6):
+    def __init__(
+        self,
+        mesh: trimesh.Trimesh,
+        *,
+        resolution: int = 96,
+        centre: Float[ArrayLike, " 3"] | None = None,
+        crease: float = np.pi / 6,
+    ):
         if not isinstance(resolution, int | np.integer) or resolution < 16:
             raise ValueError(f"resolution must be an integer of 16 or more nodes a side, got {resolution!r}")
         if not 0 < crease < np.pi:
@@ -142,9 +151,9 @@ class MeshSurface(Surface):
         self.warnings = self._words(int(resolution))
 
     @classmethod
-    def from_body(cls, body: Body, resolution: int = 96, crease: float = np.pi / 6) -> MeshSurface:
+    def from_body(cls, body: Body, *, resolution: int = 96, crease: float = np.pi / 6) -> MeshSurface:
         """The surface of a body, about the body's own centre of mass."""
-        return cls(body.mesh, resolution, body.centre_of_mass, crease)
+        return cls(body.mesh, resolution=resolution, centre=body.centre_of_mass, crease=crease)
 
     @property
     def grid(self) -> DistanceGrid:
@@ -152,15 +161,18 @@ class MeshSurface(Surface):
         return self.smooth.grid
 
     @property
-    def centre(self) -> Array:
+    def centre(self) -> Float[Array, " 3"]:
+        """The centre of mass, m."""
         return self.smooth.centre
 
     @property
-    def radius(self) -> Array:
+    def radius(self) -> Float[Array, ""]:
+        """The largest distance of the surface from ``centre``, m."""
         return self.smooth.radius
 
     @property
     def traced(self) -> GridSurface:
+        """The spline without the triangles: what to hand to a jitted function."""
         return self.smooth
 
     def _contact(self, point: Float[Array, " 3"]) -> tuple[Array, Array]:
@@ -189,7 +201,7 @@ class MeshSurface(Surface):
             )
         return tuple(words)
 
-    def project_exact(self, point: Any) -> NearestPoint:
+    def project_exact(self, point: Float[ArrayLike, "*batch 3"]) -> NearestPoint:
         """``argmin_x |x - p|`` over the triangles, exact to rounding, on the host: points (*batch, 3) in m.
 
         Points with NaN or infinite coordinates get NaN, and -1 for their face. Of several nearest faces the one
@@ -216,7 +228,8 @@ class MeshSurface(Surface):
             shaped(distance),
         )
 
-    def exact_contact(self, point: Any) -> tuple[np.ndarray, np.ndarray]:
+    def exact_contact(self, point: Float[ArrayLike, "*batch 3"]) -> tuple[np.ndarray, np.ndarray]:
+        """Nearest points (*batch, 3) of the triangles, m, and their faces' inward normals: exact to rounding."""
         near = self.project_exact(point)
         return near.point, near.normal
 

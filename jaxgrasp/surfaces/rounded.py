@@ -6,14 +6,12 @@ where no direction is given, p moves straight to the nearest flat side.
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ..core import Array, Float
+from ..core import Array, ArrayLike, Float
 from .surface import Surface, centre_or_origin, directions, generator, on_host, parameter, same_dtype, unit_or
 
 __all__ = ["Cylinder", "RoundedBox", "Sphere"]
@@ -37,7 +35,7 @@ class Sphere(Surface):
     radius: Float[Array, ""]
     centre: Float[Array, " 3"]
 
-    def __init__(self, radius: Any, centre: Any = None):
+    def __init__(self, radius: Float[ArrayLike, ""], centre: Float[ArrayLike, " 3"] | None = None):
         self.radius, self.centre = same_dtype(parameter(radius, (), "radius"), centre_or_origin(centre))
 
     def _contact(self, point: Float[Array, " 3"]) -> tuple[Array, Array]:
@@ -63,7 +61,12 @@ class RoundedBox(Surface):
     rounding: Float[Array, ""]
     centre: Float[Array, " 3"]
 
-    def __init__(self, half_extents: Any, rounding: Any, centre: Any = None):
+    def __init__(
+        self,
+        half_extents: Float[ArrayLike, " 3"],
+        rounding: Float[ArrayLike, ""],
+        centre: Float[ArrayLike, " 3"] | None = None,
+    ):
         self.half_extents, self.rounding, self.centre = same_dtype(
             parameter(half_extents, (3,), "half_extents"),
             parameter(rounding, (), "rounding"),
@@ -72,7 +75,7 @@ class RoundedBox(Surface):
         _check_rounding(self.rounding, jnp.min(self.half_extents), "the least half extent")
 
     @property
-    def radius(self) -> Array:
+    def radius(self) -> Float[Array, ""]:
         """``|half_extents - rounding| + rounding``, m."""
         return jnp.sqrt(jnp.sum((self.half_extents - self.rounding) ** 2)) + self.rounding
 
@@ -125,7 +128,13 @@ class Cylinder(Surface):
     rounding: Float[Array, ""]
     centre: Float[Array, " 3"]
 
-    def __init__(self, side: Any, half_height: Any, rounding: Any, centre: Any = None):
+    def __init__(
+        self,
+        side: Float[ArrayLike, ""],
+        half_height: Float[ArrayLike, ""],
+        rounding: Float[ArrayLike, ""],
+        centre: Float[ArrayLike, " 3"] | None = None,
+    ):
         self.side, self.half_height, self.rounding, self.centre = same_dtype(
             parameter(side, (), "side"),
             parameter(half_height, (), "half_height"),
@@ -138,7 +147,7 @@ class Cylinder(Surface):
         return jnp.stack([self.side, self.half_height]) - self.rounding
 
     @property
-    def radius(self) -> Array:
+    def radius(self) -> Float[Array, ""]:
         """``|(side, half_height) - rounding| + rounding``, m."""
         return jnp.sqrt(jnp.sum(self._core() ** 2)) + self.rounding
 

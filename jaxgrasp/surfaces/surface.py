@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ..core import Array, Float, contact_frame
+from ..core import Array, ArrayLike, Float, contact_frame
 
 __all__ = [
     "SmoothSurface",
@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 
-def _points(value: Any, dtype: Any) -> Array:
+def _points(value: ArrayLike, dtype: Any) -> Array:
     """``value`` as (*batch, 3) of ``dtype``; ValueError for any other shape."""
     array = jnp.asarray(value)
     if array.ndim < 1 or array.shape[-1] != 3:
@@ -42,7 +42,7 @@ def _points(value: Any, dtype: Any) -> Array:
     return array.astype(dtype)
 
 
-def parameter(value: Any, shape: tuple[int, ...], name: str, positive: bool = True) -> Array:
+def parameter(value: ArrayLike, shape: tuple[int, ...], name: str, positive: bool = True) -> Array:
     """A real parameter of a shape; ValueError for a wrong shape and, where the value is known, a wrong number."""
     array = jnp.asarray(value)
     if array.shape != shape:
@@ -57,7 +57,7 @@ def parameter(value: Any, shape: tuple[int, ...], name: str, positive: bool = Tr
     return array
 
 
-def centre_or_origin(centre: Any) -> Array:
+def centre_or_origin(centre: Float[ArrayLike, " 3"] | None) -> Array:
     """A shape's centre, by default the origin."""
     return parameter(jnp.zeros(3) if centre is None else centre, (3,), "centre", positive=False)
 
@@ -108,8 +108,8 @@ class SmoothSurface(eqx.Module):
     pytree, and a closure would compile its arrays in.
     """
 
-    centre: eqx.AbstractVar[Array]
-    radius: eqx.AbstractVar[Array]
+    centre: eqx.AbstractVar[Float[Array, " 3"]]
+    radius: eqx.AbstractVar[Float[Array, ""]]
 
     @abc.abstractmethod
     def _contact(self, point: Float[Array, " 3"]) -> tuple[Array, Array]:
@@ -157,31 +157,35 @@ class SmoothSurface(eqx.Module):
         """What to hand to a jitted function: equal shapes of arrays, equal programs."""
         return self
 
-    def contact(self, point: Any) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch 3"]]:
+    def contact(
+        self, point: Float[ArrayLike, "*batch 3"]
+    ) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch 3"]]:
         """``project`` and ``normal`` at the price of one of them."""
         return self._answer("_contact", "(d),(d)", point)
 
-    def project(self, point: Any) -> Float[Array, "*batch 3"]:
+    def project(self, point: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch 3"]:
         """``argmin_x |x - p|`` over the surface, m; a fixed one of them where several are nearest."""
         return self.contact(point)[0]
 
-    def slide(self, point: Any) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch 3"]]:
+    def slide(
+        self, point: Float[ArrayLike, "*batch 3"]
+    ) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch 3"]]:
         """``contact`` for points that are on the surface: ``dx/dp = T T^T``, at a fraction of the price."""
         return self._answer("_slide", "(d),(d)", point)
 
-    def retract(self, point: Any) -> Float[Array, "*batch 3"]:
+    def retract(self, point: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch 3"]:
         """A point of the surface for points near it, such as after a small step: nearly ``project``, cheaper."""
         return self._answer("_retract", "(d)", point)
 
-    def normal(self, point: Any) -> Float[Array, "*batch 3"]:
+    def normal(self, point: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch 3"]:
         """Inward unit normal at ``project(point)``; on the surface its derivative is minus the shape operator."""
         return self.contact(point)[1]
 
-    def distance(self, point: Any) -> Float[Array, "*batch"]:
+    def distance(self, point: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch"]:
         """``+-|p - project(p)|``: signed distance, m, negative inside."""
         return self._answer("_distance", "()", point)
 
-    def curvature(self, point: Any) -> Float[Array, "*batch 2"]:
+    def curvature(self, point: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch 2"]:
         """Principal curvatures at ``project(point)``, 1/m, the smaller first; positive where convex (1/r on a ball).
 
         The eigenvalues of ``-T^T (dn/dp) T`` for the inward normal n and tangents T. Their own derivatives are those
@@ -189,7 +193,7 @@ class SmoothSurface(eqx.Module):
         """
         return self._answer("_curvature", "(c)", point)
 
-    def edge_distance(self, point: Any) -> Float[Array, "*batch"]:
+    def edge_distance(self, point: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch"]:
         """Distance of ``project(point)`` to the nearest sharp edge, m; infinite where the surface has none."""
         return self._answer("_edge_distance", "()", point)
 
@@ -209,7 +213,7 @@ class Surface(SmoothSurface):
         On the host, in float64; the same seed gives the same bytes. ValueError for a negative seed or count.
         """
 
-    def exact_contact(self, point: Any) -> tuple[np.ndarray, np.ndarray]:
+    def exact_contact(self, point: Float[ArrayLike, "*batch 3"]) -> tuple[np.ndarray, np.ndarray]:
         """Positions (*batch, 3) in m and inward normals of contacts on the real surface, for a mesh its triangles."""
         position, normal = self.contact(point)
         return np.asarray(position), np.asarray(normal)
