@@ -41,7 +41,11 @@ def stop_before(monkeypatch, number):
     monkeypatch.setattr(shards, "_write", write)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(
+    "test_a_stopped_check_goes_on_where_it_was",
+    "test_control.py::test_errors_decay_at_the_designed_rate_with_forces_in_their_cones",
+    "test_controllability.py::test_fixed_cases",
+)
 def test_grasps_of_the_mug_are_checked(capsys, tmp_path, monkeypatch):
     """60 grasps in chunks of 25, stopped after two of them and gone on with: the bytes of an uninterrupted run."""
     words = ["check", "mug", "--mass", "0.3", "--fingers", "3", "--most", "60", "--chunk", "25", "--row", "5"]

@@ -80,7 +80,6 @@ def test_a_sweep_of_factors():
         jg.quality.friction_sweep(grasp, factors[None])
 
 
-@pytest.mark.slow("test_two_planar_fingers_need_the_tangent_of_the_larger_angle")
 def test_spatial_grasps_against_bisection_with_clarabel():
     position, normal, friction = ball(np.random.default_rng(8), 500, 4)
     grasp = jg.Grasp(position, normal, jg.HardFinger(friction))

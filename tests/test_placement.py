@@ -94,7 +94,7 @@ def test_excesses_are_distances():
     assert float(EdgeClearance(0.03).excess(box, corner, corner)) == pytest.approx(0.02, abs=1e-6)
 
 
-def test_mistakes_are_answered():
+def test_mistakes_are_answered(monkeypatch):
     with pytest.raises(ValueError, match=r"surface must be a jaxgrasp\.surfaces\.Surface"):
         placement.place_contacts("mug")
     with pytest.raises(ValueError, match="fingers must be an integer of 1 or more"):
@@ -105,6 +105,7 @@ def test_mistakes_are_answered():
         Search(settling=-1)
     with pytest.raises(ValueError, match=r"requirements must be those of jaxgrasp\.placement"):
         placement.place_contacts(BALL, requirements=[0.02])
+    monkeypatch.setattr(placement, "DRAWS", 4)  # of the many after which it gives up
     with pytest.raises(UserError, match="no contact on this surface meets the requirements"):
         placement.place_contacts(BALL, search=Search(4), requirements=[Within(lambda p: p[0] - 5.0)])
 

@@ -78,7 +78,7 @@ def derivatives(scene):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_derivatives_hold_in_motion_too")
 def test_A_and_B_are_mujocos(scene, derivatives):
     """(11.29) against d qacc / d (tangent, f) on 1 000 bodies and grasps, 1e-6; the factor g included."""
     body, grasp, _, gravity, held, _ = scene
@@ -90,7 +90,7 @@ def test_A_and_B_are_mujocos(scene, derivatives):
     assert relative(0.9 * by_state, analytic)[held].min() > 1e-3  # the test can fail
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_one_step_is_semi_implicit_euler", "test_derivatives_hold_in_motion_too")
 def test_mujocos_step_is_their_semi_implicit_image(scene, derivatives):
     """``[[I + h^2 A_c, h I], [h A_c, I]]`` and ``[h^2 B_c; h B_c]`` to 1e-6."""
     body, grasp, _, gravity, held, _ = scene
@@ -105,7 +105,7 @@ def test_mujocos_step_is_their_semi_implicit_image(scene, derivatives):
     assert relative(by_force, B).max() < 1e-6
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_dynamics.py::test_rotations_have_derivatives_at_zero")
 def test_mjx_alone_forgets_how_a_resting_body_starts_to_turn():
     """Why the plant integrates rotations below 1e-8 rad/s itself. Fails when MJX no longer needs that."""
     from jaxgrasp.motion.mujoco import _mjx
@@ -121,7 +121,6 @@ def test_mjx_alone_forgets_how_a_resting_body_starts_to_turn():
     np.testing.assert_allclose(jax.jacfwd(turned_by)(jnp.full(3, 1e-7)), H / 2 * np.eye(3), atol=1e-9)
 
 
-@pytest.mark.slow
 def test_derivatives_hold_in_motion_too(scene):
     """At any state, against automatic derivatives of the analytic acceleration in the same coordinates."""
     body, grasp, force, gravity, _, plant = scene
@@ -144,7 +143,7 @@ def test_derivatives_hold_in_motion_too(scene):
         assert relative(a, b).max() < 1e-8
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_derivatives_hold_in_motion_too")
 def test_reverse_mode_gives_the_same(scene):
     body, grasp, force, gravity, _, _ = scene
     one = jax.tree.map(lambda x: x[0], (body, grasp, force))
@@ -181,7 +180,7 @@ def c_engine(body, grasp, force, start, gravity):
     return jg.BodyState(*(jnp.asarray(x) for x in np.split(states, [3, 7], axis=-1)))
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_one_step_is_semi_implicit_euler")
 def test_rollouts_are_those_of_the_c_engine(scene):
     """125 bodies, 100 steps, random forces that turn with the body, from a tumbling start: MJX and the analytic step,
     to 1e-6 at every step."""
