@@ -336,7 +336,8 @@ def main(arguments: list[str] | None = None) -> int:
         make_reference(options.make_reference, min(options.lanes, BLOCK), lambda s: print(s, flush=True))
         return 0
     reference = Reference.read(options.reference)
-    results = Results(options.json, {name: str(value) for name, value in vars(options).items()})
+    asked = {k: v.name if isinstance(v, Path) else str(v) for k, v in vars(options).items()}
+    results = Results(options.json, asked)
     content = results.content
     for name, ask in (
         ("hardware", hardware),
