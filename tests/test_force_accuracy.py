@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from force_oracle import clarabel_forces
 from force_problems import CRITERIA, problems
+from shapes import HARD
 
 import jaxgrasp as jg
 from jaxgrasp import Status
@@ -11,8 +12,9 @@ from jaxgrasp import Status
 
 def frictionless_support(dtype):
     """Two rows of frictionless contacts and one with friction: mu = 0 is a number like any other."""
-    position = np.array([[-1.0, 0, 0], [1.0, 0, 0], [0.0, 0, -1.0]], dtype)
-    return jg.Grasp(position, -position, jg.HardFinger(np.array([0.0, 0.5, 0.0], dtype)))
+    position = np.array([[-1.0, 0, 0], [1.0, 0, 0], [0.0, 0, -1.0], [0.0, 0, 1.0]], dtype)
+    friction, active = np.array([0.0, 0.5, 0.0, 0.0], dtype), np.arange(HARD) < 3  # the last is padding
+    return jg.Grasp(position, -position, jg.HardFinger(friction), active)
 
 
 def test_forces_of_contacts_without_friction():
@@ -22,8 +24,8 @@ def test_forces_of_contacts_without_friction():
     for criterion in (jg.SmallestSum(), jg.LeastNorm()):
         out = jg.optimize_forces(grasp, load, criterion=criterion)
         assert int(out.status) == Status.OPTIMAL
-        force = np.asarray(out.force).reshape(3, 3)
-        np.testing.assert_allclose(force, [[0, 0, 0], [0, 0, 2], [0, 0, 3]], atol=1e-6)
+        force = np.asarray(out.force).reshape(HARD, 3)
+        np.testing.assert_allclose(force, [[0, 0, 0], [0, 0, 2], [0, 0, 3], [0, 0, 0]], atol=1e-6)
         assert bool(jg.check(grasp, out, wrench=load, criterion=criterion))
 
 
