@@ -6,6 +6,9 @@ All workers, and the processes that tests start, share one store of compiled pro
 ``JAX_COMPILATION_CACHE_DIR``, or ``.jax_test_cache`` in the checkout, which keeps the next run warm.
 """
 
+import contextlib
+import ctypes
+import gc
 import os
 import shutil
 import tempfile
@@ -75,6 +78,32 @@ def pytest_collection_modifyitems(config, items):
     for item in items:
         if item.path.stem in INTERFACES:
             item.add_marker(pytest.mark.interface)
+
+
+# Tracing makes so many objects that a third of its time is a search for garbage; files are searched between instead.
+gc.disable()
+RESIDENT_BYTES = 2_000_000_000
+
+
+def resident() -> float:
+    """Bytes of memory that this process holds; inf where the system does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return float("inf")
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def bounded_memory():
+    """A compiled program keeps about 100 MB: after a file, all are dropped if there are many; the store has them."""
+    yield
+    if resident() < RESIDENT_BYTES:
+        return
+    jax.clear_caches()
+    gc.collect()
+    with contextlib.suppress(OSError, AttributeError):  # only glibc has it
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 @pytest.fixture(scope="session")
