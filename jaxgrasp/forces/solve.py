@@ -1,8 +1,8 @@
 """11.3: with which contact forces, and at what least cost, does a grasp balance a load?
 
-One lane's way: fold and orthonormalise as for wrench resistance; scale the load (``balance.balance``); iterate to the
-optimum or to a proof that there is none (``solver.primal_dual``); read the answer off and bound it
-(``optimum.answer``). Everyone for a few iterations, then the stragglers, then the answers.
+One lane's way: fold and orthonormalise as for wrench resistance; scale the load (``problem.force_problem``); iterate to
+the optimum or to a proof that there is none (``conic.convex_interior_point``); read the answer off and bound it
+(``answer.answer``). Everyone for a few iterations, then the stragglers, then the answers.
 """
 
 from __future__ import annotations
@@ -15,10 +15,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.typing import ArrayLike
 
-from ..backend import batched, in_chunks, in_sweeps, kernel, tile_width, to_lanes, to_rows
+from ..backend import batched, in_chunks, in_sweeps, is_traced, kernel, tile_width, to_lanes, to_rows
 from ..certificates import check_forces, checked_by, force_claim
 from ..conic import ConvexState, as_vector, begin_convex_cone_program, regular, solve_convex_cone_program
 from ..contacts import Component, Grasp, TorqueLimits, tile_of, to_twist
@@ -209,8 +208,7 @@ _solve_chunk = jax.jit(_solve_rows, static_argnames=("plan",))
 
 
 def _solved(plan: _Plan, rows: Rows, tolerance: Array) -> Solved:
-    leaves = jax.tree.leaves((rows, tolerance))
-    if any(isinstance(x, Tracer) for x in leaves) or jax.default_backend() != "cpu":
+    if is_traced((rows, tolerance)) or jax.default_backend() != "cpu":
         return _compiled(plan._replace(with_point=True))(rows, tolerance)
 
     def run(part: Rows, count: Array) -> Solved:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..contacts import Grasp, null_space
+from ..contacts import Grasp, is_grasp, null_space
 from ..core import Array, Bool, Float, rank_tolerance
 from .barrier import lmi_minimize
 from .problem import LMIProblem, expect_shape
@@ -126,15 +126,6 @@ def _margin_problem(grasp: Grasp) -> tuple[LMIProblem, Bool[Array, "*batch"]]:
     cost = jnp.zeros(matrices.shape[:-2], dtype).at[..., -1].set(-1.0)
     start = jnp.zeros_like(cost).at[..., -1].set(jnp.linalg.eigvalsh(constant)[..., 0] - 1.0)
     return LMIProblem(cost, constant, matrices, start), squeezes
-
-
-def is_grasp(grasp: Grasp) -> Bool[Array, "*batch"]:
-    """Whether the numbers of the active contacts, at least one, describe a grasp: finite, a normal, mu, gamma >= 0."""
-    mu, gamma = grasp.model.friction_coefficient, grasp.model.torsion_coefficient
-    valid = jnp.all(~grasp.active | ((mu >= 0) & (gamma >= 0)), axis=-1) & jnp.any(grasp.active, axis=-1)
-    finite = jnp.all(jnp.isfinite(grasp.position) & jnp.isfinite(grasp.normal), axis=-1)
-    valid &= jnp.all(~grasp.active | (finite & jnp.any(grasp.normal != 0, axis=-1)), axis=-1)
-    return valid & jnp.all(~grasp.active | (jnp.isfinite(mu) & jnp.isfinite(gamma)), axis=-1)
 
 
 @eqx.filter_jit

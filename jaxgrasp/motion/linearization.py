@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from ..contacts import Grasp, folded_grasp_map, grasp_map, length_scale
+from ..contacts import Grasp, folded_grasp_map, grasp_map, is_grasp, length_scale
 from ..core import (
     Answer,
     Array,
@@ -171,7 +171,7 @@ def linearize(
             )
         forces = jnp.broadcast_to(forces, (*grasp.batch_shape, size))
         point, slack = _judged(grasp, load, forces)
-        good = _good_numbers(grasp)
+        good = is_grasp(grasp)
         point = jnp.where(good, point, jnp.int32(Status.INVALID.value))
     point = jnp.where(fit, point, jnp.int32(Status.INVALID.value))
     there = is_equilibrium(point)
@@ -186,19 +186,9 @@ def linearize(
     )
 
 
-def _good_numbers(grasp: Grasp) -> Array:
-    """Lanes whose numbers are a grasp: finite, non-negative coefficients, normals of some length, a contact."""
-    model, live = grasp.model, grasp.active
-    fine = jnp.all(jnp.isfinite(grasp.position) & jnp.isfinite(grasp.normal), axis=-1)
-    fine &= jnp.any(grasp.normal != 0, axis=-1)
-    for coefficient in (model.friction_coefficient, model.torsion_coefficient):
-        fine &= jnp.isfinite(coefficient) & (coefficient >= 0)
-    return jnp.all(fine | ~live, axis=-1) & jnp.any(live, axis=-1)
-
-
 def _sound(grasp: Grasp) -> Grasp:
     """The grasp with harmless numbers wherever a contact does not exist or its lane is none: no NaN, no derivative."""
-    live = grasp.active & _good_numbers(grasp)[..., None]
+    live = grasp.active & is_grasp(grasp)[..., None]
     upright = jnp.zeros(grasp.dimension, grasp.dtype).at[-1].set(1.0)
     scaling = (
         jnp.where(live, c, jnp.zeros_like(c))

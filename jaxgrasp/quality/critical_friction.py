@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import Tracer
 from jax.typing import ArrayLike
 
+from ..backend import is_traced
 from ..contacts import ContactModel, Grasp
 from ..core import Answer, Array, Float, Int, Status
 from ..resistance import WrenchResistance, wrench_resistance
@@ -188,7 +188,7 @@ def _grasp(data: _Data, model: ContactModel, active: Array) -> Grasp:
 @jax.custom_jvp
 def _critical(data: _Data, model: ContactModel, active: Array) -> tuple[Array, Array, Array]:
     grasp = _grasp(data, model, active)
-    traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(grasp))
+    traced = is_traced(grasp)
     low, high = _search(grasp, lax.while_loop if traced else _python_loop)
     lower, upper = jnp.exp(low), jnp.exp(high)
     factor = jnp.exp((low + high) / 2)

@@ -20,10 +20,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import Tracer
 from jax.typing import ArrayLike
 
-from ..backend import batched, in_chunks, map_tiles
+from ..backend import batched, in_chunks, is_traced, map_tiles
 from ..certificates import check_epsilon, checked_by
 from ..contacts import Grasp
 from ..core import Answer, Array, Bool, Float, Int, Status
@@ -256,7 +255,7 @@ def epsilon_quality(
     rows = _Rows(lax.stop_gradient(A), grasp.active, scaled(still, verdict.internal_force), resistant)
     plan = _Plan(norm, bool(certificate))
     goal = jnp.asarray(tolerance, grasp.dtype)
-    traced = any(isinstance(x, Tracer) for x in jax.tree.leaves((rows, goal)))
+    traced = is_traced((rows, goal))
     found = _compiled(plan)(rows, goal) if traced else _on_host(plan, rows, goal)
 
     away = _unresisted(grasp, verdict.escape_twist, lax.stop_gradient(length))

@@ -1,8 +1,8 @@
 """11.1-11.2: is the grasp wrench resistant (force closure), by how much, and why.
 
-One grasp's way: fold mu and gamma into its grasp map (``margin.fold``); project unit normal forces onto the internal
-forces, which decides many grasps at once and starts the rest (``margin.starting_point``); close the bracket around the
-margin (``solver``); certify (``verdict.judge``). Three sweeps over the tiles: everyone for a few iterations,
+One grasp's way: fold mu and gamma into its grasp map (``contacts.fold``); project unit normal forces onto the internal
+forces, which decides many grasps at once and starts the rest (``problem.starting_point``); close the bracket around the
+margin (``conic``); certify (``verdict.judge``). Three sweeps over the tiles: everyone for a few iterations,
 then the stragglers, then the answers; grasps of doubtful rank get their singular values in between.
 """
 
@@ -16,9 +16,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import Tracer
 
-from ..backend import batched, in_chunks, kernel, map_selected, map_tiles, tile_width, to_lanes, to_rows
+from ..backend import (
+    batched,
+    in_chunks,
+    is_traced,
+    kernel,
+    map_selected,
+    map_tiles,
+    tile_width,
+    to_lanes,
+    to_rows,
+)
 from ..certificates import check_resistance, checked_by
 from ..conic import (
     LinearConeProgram,
@@ -339,7 +348,7 @@ def wrench_resistance(
     floor = gap_floor(grasp.dtype)
     goal = jnp.maximum(jnp.asarray(tolerance, grasp.dtype), jnp.asarray(floor, grasp.dtype))
     contacts = contacts_of(grasp)
-    traced = any(isinstance(x, Tracer) for x in (*contacts, goal))
+    traced = is_traced((contacts, goal))
     if traced or jax.default_backend() != "cpu":
         return _compiled(plan._replace(with_point=not verdict_only))(contacts, goal)
     return _solve_on_host(plan, contacts, goal)
