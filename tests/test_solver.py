@@ -467,10 +467,27 @@ def test_sweeps_return_to_what_is_unfinished_and_to_nothing_else():
     rows = jnp.array([1, 2, 3, 4, 5, 6, 7, 8], jnp.int32)
     shapes = {"left": rows, "sweeps": rows}
 
-    def kernel(start, out, sweep):
+    def step(start, _, out, sweep):
         left = jnp.where(sweep == 0, start, out["left"])
         return {"left": jnp.maximum(left - 2, 0), "sweeps": out["sweeps"] + 1}
 
-    out = lanes.in_sweeps(kernel, rows, shapes, lambda out: out["left"] > 0, jnp.int32(7), 3, 4)
+    sweeps = lanes.Sweeps(step, lambda out: out["left"] > 0, 3)
+    out = lanes.in_sweeps(sweeps, rows, None, shapes, jnp.int32(7), 4)
     np.testing.assert_array_equal(out["left"], [0, 0, 0, 0, 0, 0, 1, 0])
     np.testing.assert_array_equal(out["sweeps"], [1, 1, 2, 2, 3, 3, 3, 0])
+
+
+def test_what_a_sweep_makes_necessary_is_known_in_the_next():
+    """Odd rows ask for their square and are answered before the second sweep; nobody else is."""
+    rows = jnp.arange(8, dtype=jnp.int32)
+    shapes = {"asks": rows, "answer": rows}
+
+    def step(start, square, out, sweep):
+        return {"asks": jnp.where(sweep == 0, start % 2, 0), "answer": square}
+
+    def between(square, out):
+        return jnp.where(out["asks"] > 0, rows * rows, square)
+
+    sweeps = lanes.Sweeps(step, lambda out: out["asks"] > 0, 2, between)
+    out = lanes.in_sweeps(sweeps, rows, jnp.full(8, -1, jnp.int32), shapes, jnp.int32(8), 4)
+    np.testing.assert_array_equal(out["answer"], [-1, 1, -1, 9, -1, 25, -1, 49])

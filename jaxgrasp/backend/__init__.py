@@ -1,10 +1,21 @@
 """The machine under the numbers: tiles of grasps, devices and precision, and what XLA is asked for."""
 
 from .device import precision, remember_compilations, usable_backend
-from .tiles import batched, in_chunks, in_sweeps, map_selected, map_tiles, tile_width, to_lanes, to_rows
+from .tiles import (
+    Sweeps,
+    batched,
+    in_chunks,
+    in_sweeps,
+    map_selected,
+    map_tiles,
+    tile_width,
+    to_lanes,
+    to_rows,
+)
 from .xla import inlined, is_traced, kernel, stage
 
 __all__ = [
+    "Sweeps",
     "batched",
     "in_chunks",
     "in_sweeps",

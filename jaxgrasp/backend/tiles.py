@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +18,13 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 
 from ..core import Array
+from .xla import kernel
 
 __all__ = [
+    "Sweeps",
     "batched",
     "in_chunks",
+    "in_sweeps",
     "map_selected",
     "map_tiles",
     "padded_rows",
@@ -152,45 +155,58 @@ class Packing:
         return jax.tree.unflatten(self._structure, leaves)
 
 
-def in_sweeps(
-    kernel: Callable[[Any, Any, Array], Any],
-    rows: Any,
-    like: Any,
-    unfinished: Callable[[Any], Array],
-    count: Array,
-    sweeps: int,
-    width: int,
-) -> Any:
-    """``out = kernel(rows, out, sweep)`` on the first ``count`` rows, then again on those still ``unfinished(out)``.
+class Sweeps(NamedTuple):
+    """What is done to rows again and again: all of them once, then those that are still unfinished.
 
-    ``like`` gives the shapes of ``out``, which begins as zeros. Each sweep gathers its rows into full tiles, so the
-    cost follows their number. The kernel is compiled once.
+    step        ``out = step(rows, aside, out, sweep)`` on one tile: compiled once, as a kernel
+    unfinished  ``unfinished(out)`` (N,) bool
+    count       how many sweeps at most
+    between     ``aside = between(aside, out)`` before each sweep, on all rows: what the last one made necessary
+    """
+
+    step: Callable[[Any, Any, Any, Array], Any]
+    unfinished: Callable[[Any], Array]
+    count: int
+    between: Callable[[Any, Any], Any] = lambda aside, out: aside
+
+
+def in_sweeps(sweeps: Sweeps, rows: Any, aside: Any, like: Any, count: Array, width: int) -> Any:
+    """``out`` after all sweeps over the first ``count`` rows. Each gathers its rows into full tiles: cost follows them.
+
+    ``like`` gives the shapes of ``out``, which begins as zeros. ``aside`` is a pytree of rows, or None.
     """
     n = _count(rows)
-    given, made = Packing(rows), Packing(like)
+    given, known, made = Packing(rows), Packing(aside), Packing(like)
     source = given.pack(rows)
     shapes = jax.eval_shape(made.pack, like)
     out = jax.tree.map(lambda s: jnp.zeros((n, *s.shape[1:]), s.dtype), shapes)
     live = jnp.arange(n, dtype=jnp.int32) < count
 
-    def sweep(carry: tuple[Array, Any]) -> tuple[Array, Any]:
-        number, out = carry
-        selected = live & ((number == 0) | unfinished(made.unpack(out)))
+    @kernel
+    def step(rows: Any, aside: Any, before: Any, number: Array) -> Any:
+        return made.pack(sweeps.step(given.unpack(rows), known.unpack(aside), made.unpack(before), number))
+
+    def sweep(carry: tuple[Array, Any, Any]) -> tuple[Array, Any, Any]:
+        number, aside, out = carry
+        before = made.unpack(out)
+        aside = known.pack(sweeps.between(known.unpack(aside), before))
+        selected = live & ((number == 0) | sweeps.unfinished(before))
         index = jnp.nonzero(selected, size=n, fill_value=n)[0].astype(jnp.int32)
         tiles = _tiles(jnp.sum(selected, dtype=jnp.int32), width)
 
         def one_tile(carry: tuple[Array, Any]) -> tuple[Array, Any]:
             tile, current = carry
             chosen = lax.dynamic_slice(index, (tile * jnp.int32(width),), (width,))
-            here, before = jax.tree.map(lambda x: x.at[chosen].get(mode="clip"), (source, current))
-            result = made.pack(kernel(given.unpack(here), made.unpack(before), number))
+            here = jax.tree.map(lambda x: x.at[chosen].get(mode="clip"), (source, aside, current))
+            result = step(*here, number)
             updated = jax.tree.map(lambda x, r: x.at[chosen].set(r, mode="drop"), current, result)
             return tile + jnp.int32(1), updated
 
-        return number + 1, lax.while_loop(lambda carry: carry[0] < tiles, one_tile, (jnp.int32(0), out))[1]
+        out = lax.while_loop(lambda carry: carry[0] < tiles, one_tile, (jnp.int32(0), out))[1]
+        return number + 1, aside, out
 
-    out = lax.while_loop(lambda carry: carry[0] < sweeps, sweep, (jnp.int32(0), out))[1]
-    return made.unpack(out)
+    start = (jnp.int32(0), known.pack(aside), out)
+    return made.unpack(lax.while_loop(lambda carry: carry[0] < sweeps.count, sweep, start)[2])
 
 
 def in_chunks(solve: Callable[[Any, Array], Any], rows: Any, batch: tuple[int, ...], chunk: int) -> Any:

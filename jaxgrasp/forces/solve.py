@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from ..backend import batched, in_chunks, in_sweeps, is_traced, kernel, tile_width, to_lanes, to_rows
+from ..backend import Sweeps, batched, in_chunks, in_sweeps, is_traced, tile_width, to_lanes, to_rows
 from ..certificates import check_forces, checked_by, force_claim
 from ..conic import ConvexState, as_vector, begin_convex_cone_program, regular, solve_convex_cone_program
 from ..contacts import Component, Grasp, TorqueLimits, tile_of, to_twist
@@ -135,25 +135,21 @@ class _Progress(NamedTuple):
     multipliers: Array | None
 
 
-def _tile_kernel(plan: _Plan) -> Callable[..., _Progress]:
-    """A tile's whole way. One kernel for first steps and stragglers alike: it is what takes long to compile."""
-
-    @kernel
-    def run(rows: Rows, state: ConvexState, fresh: Array, budget: Array, tolerance: Array) -> _Progress:
-        problem = _problem(plan, rows)
-        load = problem.load
-        weighted = problem.demand.criterion.barrier_weight is not None
-        idle = jnp.zeros_like(load.rest) if weighted else load.rest
-        skip = ~problem.valid | load.off | idle
-        start = begin_convex_cone_program(problem.program, starting_point(problem), skip)
-        state = jax.tree.map(lambda new, old: jnp.where(fresh, new, old), start, _to_lanes(state))
-        # A robust bound is read off the forces, which doubles what they lack.
-        goal = tolerance / 10 if weighted else tolerance
-        rounding = 8 * unit_roundoff(tolerance.dtype)
-        state = solve_convex_cone_program(problem.program, state, goal, proves, budget, rounding)
-        return _to_rows(_progress(plan, problem, state, answer(problem, state, 4 * tolerance)))
-
-    return run
+def _advance(plan: _Plan, rows: Rows, before: ConvexState, sweep: Array, tolerance: Array) -> _Progress:
+    """A tile's whole way, from its rows to its answers; one program for first steps and stragglers alike."""
+    problem = _problem(plan, rows)
+    load = problem.load
+    weighted = problem.demand.criterion.barrier_weight is not None
+    idle = jnp.zeros_like(load.rest) if weighted else load.rest
+    skip = ~problem.valid | load.off | idle
+    begin = begin_convex_cone_program(problem.program, starting_point(problem), skip)
+    state = jax.tree.map(lambda new, old: jnp.where(sweep == 0, new, old), begin, _to_lanes(before))
+    # A robust bound is read off the forces, which doubles what they lack.
+    goal = tolerance / 10 if weighted else tolerance
+    rounding = 8 * unit_roundoff(tolerance.dtype)
+    budget = jnp.where(sweep == 0, jnp.int32(FIRST_BUDGET), jnp.int32(TOTAL_BUDGET - FIRST_BUDGET))
+    state = solve_convex_cone_program(problem.program, state, goal, proves, budget, rounding)
+    return _to_rows(_progress(plan, problem, state, answer(problem, state, 4 * tolerance)))
 
 
 def _progress(plan: _Plan, problem: ForceProblem, state: ConvexState, result: LaneAnswer) -> _Progress:
@@ -171,18 +167,15 @@ def _progress(plan: _Plan, problem: ForceProblem, state: ConvexState, result: La
 
 def _solve_rows(plan: _Plan, rows: Rows, count: Array, tolerance: Array) -> Solved:
     """All sweeps over the first ``count`` of (N, ..) rows; N is a multiple of the tile width."""
-    run = _tile_kernel(plan)
 
-    def advance(rows: Rows, progress: _Progress, sweep: Array) -> _Progress:
-        fresh = sweep == 0
-        budget = jnp.where(fresh, jnp.int32(FIRST_BUDGET), jnp.int32(TOTAL_BUDGET - FIRST_BUDGET))
-        return run(rows, progress.state, fresh, budget, tolerance)
+    def step(rows: Rows, _: None, progress: _Progress, sweep: Array) -> _Progress:
+        return _advance(plan, rows, progress.state, sweep, tolerance)
 
     def unfinished(progress: _Progress) -> Array:
         return progress.state.stop == Status.RUNNING.value
 
-    shapes = _shapes(plan, rows)
-    state, answers, smooth, scales, y = in_sweeps(advance, rows, shapes, unfinished, count, 2, plan.width)
+    sweeps = Sweeps(step, unfinished, 2)
+    state, answers, smooth, scales, y = in_sweeps(sweeps, rows, None, _shapes(plan, rows), count, plan.width)
     point = None if y is None else state.point._replace(y=y)
     return Solved(answers, smooth, state.iterations, state.stop, point, scales)
 

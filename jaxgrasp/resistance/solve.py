@@ -2,8 +2,8 @@
 
 One grasp's way: fold mu and gamma into its grasp map (``contacts.fold``); project unit normal forces onto the internal
 forces, which decides many grasps at once and starts the rest (``problem.starting_point``); close the bracket around the
-margin (``conic``); certify (``verdict.judge``). Three sweeps over the tiles: everyone for a few iterations,
-then the stragglers, then the answers; grasps of doubtful rank get their singular values in between.
+margin (``conic``); certify (``verdict.judge``). One program for a tile's whole way, in sweeps: everyone for a few
+iterations, then the stragglers; grasps of doubtful rank get their singular values in between.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from typing import ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from ..backend import (
+    Sweeps,
     batched,
     in_chunks,
+    in_sweeps,
     is_traced,
     kernel,
     map_selected,
-    map_tiles,
     tile_width,
     to_lanes,
     to_rows,
@@ -39,7 +39,7 @@ from ..conic import (
     row_svd,
     solve_linear_cone_program,
 )
-from ..contacts import Component, Contacts, Folded, Grasp, contacts_of, fold, project, tile_of, to_twist
+from ..contacts import Component, Contacts, Folded, Grasp, Tile, contacts_of, fold, tile_of, to_twist
 from ..core import (
     Answer,
     Array,
@@ -53,14 +53,14 @@ from ..core import (
     wrench_dimension,
 )
 from .derivatives import Scales, Solved, differentiable
-from .problem import margin_program, starting_point
+from .problem import Start, margin_program, starting_point
 from .verdict import Rank, Verdict, judge
 
 __all__ = ["WrenchResistance", "wrench_resistance"]
 
-FIRST_BUDGET = 8  # iterations before stragglers are gathered: most lanes need 6 to 8 ...
-VERDICT_BUDGET = 2  # ... and most verdicts none, one or two
 TOTAL_BUDGET = 60
+BUDGETS = (8, TOTAL_BUDGET - 8)  # iterations before stragglers are gathered: most lanes need 6 to 8 ...
+VERDICT_BUDGETS = (0, 2, TOTAL_BUDGET - 2)  # ... and most verdicts none, one or two
 CHUNK = 4096  # grasps an executable takes at once when called on concrete arrays
 
 
@@ -113,28 +113,6 @@ class WrenchResistance(Answer):
         return "" if np.isnan(lower) else f"Margin between {lower:.6g} and {upper:.6g}, rank {rank}."
 
 
-class _State(NamedTuple):
-    """A lane between sweeps, as rows."""
-
-    y: Array
-    u: Array
-    z: Array
-    gap: Array
-    iterations: Array
-    stalled: Array
-    stop: Array
-
-    @classmethod
-    def pack(cls, progress: LinearState) -> _State:
-        y, u, z = (to_rows(jnp.stack(part)) for part in progress.point)
-        return cls(y, u, z, progress.gap, progress.iterations, progress.stalled, progress.stop)
-
-    def unpack(self) -> LinearState:
-        parts = [to_lanes(x) for x in (self.y, self.u, self.z)]
-        iterate = LinearPoint(*(tuple(x[i] for i in range(x.shape[0])) for x in parts))
-        return LinearState(iterate, self.gap, self.iterations, self.stalled, self.stop)
-
-
 class _Plan(NamedTuple):
     """What is fixed at trace time."""
 
@@ -143,6 +121,11 @@ class _Plan(NamedTuple):
     verdict_only: bool
     width: int
     with_point: bool  # keep the primal-dual point, for derivatives
+
+    @property
+    def budgets(self) -> tuple[int, ...]:
+        """Iterations of each sweep."""
+        return VERDICT_BUDGETS if self.verdict_only else BUDGETS
 
 
 def _room_for_rounding(folded: Folded, sigma: Array) -> Array:
@@ -168,42 +151,97 @@ def _decision(folded: Folded, sigma: Array) -> Callable[[LinearConeProgram, Line
     return decided
 
 
-class _Setup(NamedTuple):
-    """What the projection of unit forces shows, as rows."""
+class _Progress(NamedTuple):
+    """What a sweep over the tiles leaves behind, as rows; the last two only where derivatives may be wanted.
 
-    state: _State
-    sigma: Array  # proven lower bound of the smallest singular value, or 0
-    unbounded: Array  # t* = -inf
+    doubtful     int32, 1 where only singular values, not asked for yet, can tell the rank
+    multipliers  (m,) of A itself, where those of the state belong to its orthonormal rows
+    """
 
-
-def _setup_kernel(plan: _Plan) -> Callable[[Contacts], _Setup]:
-    @kernel
-    def run(contacts: Contacts) -> _Setup:
-        folded = fold(contacts, plan.components)
-        projection = project(folded)
-        start = starting_point(folded, projection)
-        program = margin_program(projection.basis)
-        refuted = start.unbounded | (start.escape if plan.verdict_only else jnp.zeros_like(start.escape))
-        dual = tuple(jnp.where(refuted, v, jnp.zeros_like(v)) for v in start.point.y)
-        state = begin_linear_cone_program(program, start.point._replace(y=dual), ~folded.valid | refuted)
-        if plan.verdict_only:
-            proven = start.lower > _room_for_rounding(folded, projection.sigma)
-            stop = jnp.where(proven, jnp.int32(Status.DECIDED.value), state.stop)
-            state = state._replace(stop=jnp.where(state.stop == Status.RUNNING.value, stop, state.stop))
-        return _Setup(_State.pack(state), projection.sigma, start.unbounded)
-
-    return run
+    state: LinearState
+    verdict: Verdict
+    doubtful: Array
+    scales: Scales | None
+    multipliers: Array | None
 
 
-def _iterate_kernel(plan: _Plan) -> Callable[..., _State]:
-    @kernel
-    def run(contacts: Contacts, rows: _State, sigma: Array, budget: Array, tolerance: Array) -> _State:
-        folded = fold(contacts, plan.components)
-        program = margin_program(project(folded).basis)
-        decided = _decision(folded, sigma) if plan.verdict_only else None
-        return _State.pack(solve_linear_cone_program(program, rows.unpack(), tolerance, budget, decided))
+class _Lanes(NamedTuple):
+    """A tile at work: the contacts, where its lanes begin, their program, and their rank as far as it is known."""
 
-    return run
+    tile: Tile
+    start: Start
+    program: LinearConeProgram
+    rank: Rank
+
+    @classmethod
+    def of(cls, plan: _Plan, contacts: Contacts, ranks: Rank) -> _Lanes:
+        tile = tile_of(contacts, plan.components, plan.dimension)
+        start = starting_point(tile.folded, tile.projection)
+        return cls(tile, start, margin_program(tile.projection.basis), jax.tree.map(to_lanes, ranks))
+
+    @property
+    def doubtful(self) -> Array:
+        """(L,) bool: the rank is not known yet."""
+        return (self.tile.projection.sigma <= 0) & (self.rank.count < 0)
+
+    @property
+    def deficient(self) -> Array:
+        """(L,) bool: singular values say that the rank is not full."""
+        asked = (self.tile.projection.sigma <= 0) & (self.rank.count >= 0)
+        return asked & (self.rank.count < wrench_dimension(self.tile.dimension))
+
+    @property
+    def sigma(self) -> Array:
+        """(L,) a lower bound of the smallest singular value of A; 0 where there is none."""
+        sigma = self.tile.projection.sigma
+        return jnp.where((sigma > 0) | self.doubtful | self.deficient, sigma, self.rank.smallest)
+
+
+def _stopped(state: LinearState, decided: Array) -> LinearState:
+    """DECIDED instead of RUNNING in the lanes of ``decided``."""
+    running = state.stop == Status.RUNNING.value
+    return state._replace(stop=jnp.where(running & decided, jnp.int32(Status.DECIDED.value), state.stop))
+
+
+def _begin(plan: _Plan, lanes: _Lanes) -> LinearState:
+    """The state before the first step; what the projection of unit forces decides needs none."""
+    folded, start = lanes.tile.folded, lanes.start
+    refuted = start.unbounded | (start.escape if plan.verdict_only else jnp.zeros_like(start.escape))
+    dual = tuple(jnp.where(refuted, v, jnp.zeros_like(v)) for v in start.point.y)
+    state = begin_linear_cone_program(lanes.program, start.point._replace(y=dual), ~folded.valid | refuted)
+    if not plan.verdict_only:
+        return state
+    return _stopped(state, start.lower > _room_for_rounding(folded, lanes.tile.projection.sigma))
+
+
+def _progress(plan: _Plan, lanes: _Lanes, state: LinearState, tolerance: Array) -> _Progress:
+    """The answers at ``state``."""
+    tile, point = lanes.tile, state.point
+    verdict = judge(tile, lanes.rank, point.u, point.y, lanes.start.unbounded, tolerance)
+    scales = multipliers = None
+    if plan.with_point:
+        scales = Scales(tile.folded.length, tile.projection.factor)
+        multipliers = jnp.stack(to_twist(tile.projection, point.y))
+    doubtful = lanes.doubtful.astype(jnp.int32)
+    return jax.tree.map(to_rows, _Progress(state, verdict, doubtful, scales, multipliers))
+
+
+def _advance(
+    plan: _Plan, contacts: Contacts, ranks: Rank, before: LinearState, sweep: Array, tolerance: Array
+) -> _Progress:
+    """A tile's whole way, from its contacts to its answers; one program for first steps and stragglers alike."""
+    lanes = _Lanes.of(plan, contacts, ranks)
+    state = jax.tree.map(
+        lambda new, old: jnp.where(sweep == 0, new, to_lanes(old)), _begin(plan, lanes), before
+    )
+    decided = None
+    if plan.verdict_only:
+        # A rank-deficient grasp has its verdict; only its margin is left to find.
+        state = _stopped(state, lanes.deficient)
+        decided = _decision(lanes.tile.folded, lanes.sigma)
+    budget = jnp.asarray(plan.budgets, jnp.int32)[sweep]
+    state = solve_linear_cone_program(lanes.program, state, tolerance, budget, decided)
+    return _progress(plan, lanes, state, tolerance)
 
 
 def _rank_kernel(plan: _Plan) -> Callable[[Contacts], Rank]:
@@ -220,66 +258,32 @@ def _rank_kernel(plan: _Plan) -> Callable[[Contacts], Rank]:
     return run
 
 
-class _Reading(NamedTuple):
-    """A lane's answer, as rows; the last two only where derivatives may be wanted."""
-
-    verdict: Verdict
-    scales: Scales | None
-    multipliers: Array | None
-
-
-def _answer_kernel(plan: _Plan) -> Callable[..., _Reading]:
-    @kernel
-    def run(
-        contacts: Contacts, rows: _State, unbounded: Array, rank_rows: Rank, tolerance: Array
-    ) -> _Reading:
-        tile = tile_of(contacts, plan.components, plan.dimension)
-        point = rows.unpack().point
-        rank = rank_rows._replace(null_twist=to_lanes(rank_rows.null_twist))
-        verdict = judge(tile, rank, point.u, point.y, unbounded, tolerance)
-        scales = multipliers = None
-        if plan.with_point:
-            scales = Scales(tile.folded.length, tile.projection.factor)
-            multipliers = jnp.stack(to_twist(tile.projection, point.y))
-        return jax.tree.map(to_rows, _Reading(verdict, scales, multipliers))
-
-    return run
-
-
 def _solve_rows(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array) -> Solved:
     """All sweeps over the first ``count`` of (N, ..) rows; N is a multiple of the tile width."""
-    m = wrench_dimension(plan.dimension)
-    n, dtype, width = contacts.position.shape[0], contacts.position.dtype, plan.width
-    setup = map_tiles(_setup_kernel(plan), contacts, count, width)
+    n, m, dtype = contacts.position.shape[0], wrench_dimension(plan.dimension), contacts.position.dtype
+    unknown = Rank(jnp.full(n, -1, dtype), jnp.zeros(n, dtype), jnp.zeros((n, m), dtype))
+    rank_of = _rank_kernel(plan)
 
-    exists = jnp.arange(n, dtype=jnp.int32) < count
+    def step(contacts: Contacts, ranks: Rank, progress: _Progress, sweep: Array) -> _Progress:
+        return _advance(plan, contacts, ranks, progress.state, sweep, tolerance)
 
-    doubtful = exists & (setup.sigma <= 0)
-    ranks = Rank(jnp.full(n, m, dtype), setup.sigma, jnp.zeros((n, m), dtype))
-    ranks = map_selected(_rank_kernel(plan), doubtful, contacts, ranks, width)
-    full_rank = ranks.count >= m
-    sigma = jnp.where(doubtful & full_rank, ranks.smallest, setup.sigma)
+    def unfinished(progress: _Progress) -> Array:
+        return (progress.state.stop == Status.RUNNING.value) | (progress.doubtful > 0)
 
-    iterate = _iterate_kernel(plan)
-    first = VERDICT_BUDGET if plan.verdict_only else FIRST_BUDGET
-    budgets = jnp.array([first, TOTAL_BUDGET - first], jnp.int32)
+    def between(ranks: Rank, progress: _Progress) -> Rank:
+        return map_selected(rank_of, progress.doubtful > 0, contacts, ranks, plan.width)
 
-    def one_round(i: Array, state: _State) -> _State:
-        # A rank-deficient grasp has its verdict; only its margin is left to find.
-        unfinished = exists & (state.stop == Status.RUNNING.value)
-        if plan.verdict_only:
-            unfinished = unfinished & full_rank
-        budget = budgets[i]
-        return map_selected(
-            lambda tile: iterate(*tile, budget, tolerance), unfinished, (contacts, state, sigma), state, width
-        )
+    def first(contacts: Contacts, ranks: Rank) -> _Progress:
+        lanes = _Lanes.of(plan, contacts, ranks)
+        return _progress(plan, lanes, _begin(plan, lanes), tolerance)
 
-    state = lax.fori_loop(0, len(budgets), one_round, setup.state)
-    answer = _answer_kernel(plan)
-    rows = (contacts, state, setup.unbounded, ranks)
-    read = map_tiles(lambda tile: answer(*tile, tolerance), rows, count, width)
-    point = None if read.multipliers is None else (read.multipliers, state.u, state.z)
-    return Solved(read.verdict, state.iterations, state.stop, point, read.scales)
+    sweeps = Sweeps(step, unfinished, len(plan.budgets), between)
+    shapes = jax.eval_shape(first, contacts, unknown)
+    state, verdict, _, scales, y = in_sweeps(sweeps, contacts, unknown, shapes, count, plan.width)
+    point = None
+    if y is not None:
+        point = (y, jnp.stack(state.point.u, 1), jnp.stack(state.point.z, 1))
+    return Solved(verdict, state.iterations, state.stop, point, scales)
 
 
 def _answer(solved: Solved) -> WrenchResistance:
