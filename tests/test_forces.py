@@ -258,3 +258,17 @@ def test_a_forged_twist_is_rejected():
     for twist in (-out.escape_twist, out.escape_twist + 0.01, 0 * out.escape_twist):
         forged = out.__class__(**{**vars(out), "escape_twist": twist})
         assert not jg.check(grasp, forged, **asked).any()
+
+
+@pytest.mark.parametrize("size", [1e-200, 1e150, 1e300])
+def test_an_escape_proves_at_any_size(size):
+    """Evidence is a ray: what it proves does not depend on its length, and nothing overflows."""
+    rng = np.random.default_rng(0)
+    grasp = ring([3], "float64")
+    jacobian, torque = rng.normal(size=(12, 2)), np.full(2, 1e-4)
+    asked = {"wrench": np.array([0.0, 0, -10, 0, 0, 0]), "criterion": jg.SmallestSum()}
+    out = jg.optimize_forces(grasp, **asked, torque_limits=(jacobian, torque))
+    assert (out.status == Status.INFEASIBLE).all()
+    longer = {"escape_twist": size * out.escape_twist, "joint_rates": size * out.joint_rates}
+    forged = out.__class__(**{**vars(out), **longer})
+    assert jg.check(grasp, forged, **asked, torque_limits=(jacobian, torque)).all()

@@ -23,10 +23,11 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.core import Tracer
 
@@ -60,6 +61,7 @@ def inlined(on: bool = True) -> Iterator[None]:
 
 def _called(function: Callable, attributes: dict[str, str]) -> Callable:
     """``function`` as a call that carries ``attributes``; the operations inside carry none."""
+    traced: dict[Any, _Traced] = {}
 
     @functools.wraps(function)
     def wrapper(*args: Any) -> Any:
@@ -70,36 +72,68 @@ def _called(function: Callable, attributes: dict[str, str]) -> Callable:
             return lax.optimization_barrier(function(*args))
         if attributes is _SMALL and os.environ.get(SWITCH, "on").lower() == "off":
             return function(*args)
-        return _call(function, attributes, args)
+        return _call(function, attributes, args, traced)
 
     return wrapper
 
 
-def _call(function: Callable, attributes: dict[str, str], args: tuple[Any, ...]) -> Any:
-    """The call itself. Inputs that nothing reads are dropped: the CPU backend aborts on a small call with one."""
-    # Imported here, so that a JAX without them fails the probe and not the import of the library.
-    from jax.core import eval_jaxpr
-    from jax.experimental.xla_metadata import set_xla_metadata
+class _Traced(NamedTuple):
+    """A function traced for arguments of one kind: the call, which inputs it reads, and the tree of its results."""
+
+    jaxpr: Any  # one equation, the call; none where the results are arguments
+    consts: list[Any]
+    used: list[bool]
+    results: Any
+
+
+def _traced(function: Callable, args: tuple[Any, ...]) -> _Traced:
+    """Inputs that nothing reads are dropped: the CPU backend aborts on a small call with one."""
+    # Imported here, so that a JAX without it fails the probe and not the import of the library.
     from jax.interpreters.partial_eval import dce_jaxpr
 
-    closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
-    live, used = dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
-    inputs = [x for x, keep in zip(jax.tree.leaves(args), used, strict=True) if keep]
-
-    def body(*values: Any) -> Any:
-        return eval_jaxpr(live, closed.consts, *values)
+    def body(*args: Any) -> Any:
+        return function(*args)
 
     body.__name__ = getattr(function, "__name__", "stage").strip("_")
-    outer = jax.make_jaxpr(jax.jit(body))(*inputs)
-    (call,) = outer.jaxpr.eqns
-    values = dict(zip(outer.jaxpr.invars, inputs, strict=True))
-    values.update(zip(outer.jaxpr.constvars, outer.consts, strict=True))
-    with set_xla_metadata(**attributes):
-        results = call.primitive.bind(*(values[v] for v in call.invars), **call.params)
-    produced = dict(zip(call.outvars, results, strict=True))
-    produced.update(values)
-    flat = [produced[v] for v in outer.jaxpr.outvars]
-    return jax.tree.unflatten(jax.tree.structure(shape), flat)
+    outer, shape = jax.make_jaxpr(jax.jit(body), return_shape=True)(*args)
+    live, used = dce_jaxpr(outer.jaxpr, [True] * len(outer.jaxpr.outvars))
+    return _Traced(live, outer.consts, used, jax.tree.structure(shape))
+
+
+def _kind(args: tuple[Any, ...]) -> Any:
+    """What a trace depends on: shapes, types and tree of the arguments, and JAX's rules for types."""
+    leaves, tree = jax.tree.flatten(args)
+    shapes = tuple(
+        (np.shape(x), jnp.result_type(x), getattr(jax.typeof(x), "weak_type", False)) for x in leaves
+    )
+    rules = [getattr(jax.config, name) for name in ("jax_enable_x64", "jax_numpy_dtype_promotion")]
+    return tree, shapes, *rules
+
+
+def _call(
+    function: Callable, attributes: dict[str, str], args: tuple[Any, ...], known: dict[Any, _Traced]
+) -> Any:
+    """The call itself. Traced once for arguments of one kind, so that it also lowers once."""
+    from jax.experimental.xla_metadata import set_xla_metadata
+
+    kind = _kind(args)
+    found = known.get(kind)
+    if found is None:
+        found = _traced(function, args)
+        if not is_traced(found.consts):  # numbers of one trace mean nothing in another
+            known[kind] = found
+    inputs = [x for x, keep in zip(jax.tree.leaves(args), found.used, strict=True) if keep]
+    values = dict(zip(found.jaxpr.invars, inputs, strict=True))
+    values.update(zip(found.jaxpr.constvars, found.consts, strict=True))
+
+    def read(v: Any) -> Any:
+        return v.val if hasattr(v, "val") else values[v]  # a literal, or a variable
+
+    for call in found.jaxpr.eqns:
+        with set_xla_metadata(**attributes):
+            results = call.primitive.bind(*(read(v) for v in call.invars), **call.params)
+        values.update(zip(call.outvars, results, strict=True))
+    return jax.tree.unflatten(found.results, [read(v) for v in found.jaxpr.outvars])
 
 
 @functools.cache
@@ -107,7 +141,7 @@ def _attributes_known() -> bool:
     """Whether a call with attributes can be traced with this JAX, and carries them into the program it lowers to."""
 
     def probe(x: jax.Array, unread: jax.Array) -> jax.Array:
-        return _call(lambda x, unread: 2 * x, _SMALL, (x, unread))
+        return _call(lambda x, unread: 2 * x, _SMALL, (x, unread), {})
 
     try:
         number = jax.ShapeDtypeStruct((), jnp.float32)

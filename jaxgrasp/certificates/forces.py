@@ -183,7 +183,9 @@ def _admissible(asked: Asked, force: np.ndarray, s: np.ndarray, sizes: Sizes, fi
 def _infeasible(asked: Asked, told: Told) -> np.ndarray:
     """The load does more work along the twist than any admissible forces can take up."""
     known, jacobian = asked.known, asked.scaled_jacobian()
-    xi, rates, x = _multipliers(asked, told.escape_twist, told.joint_rates)
+    # A proof may be scaled by any positive number: to size 1, so that nothing overflows.
+    largest = np.max(np.abs(np.concatenate([told.escape_twist, told.joint_rates], -1)), -1, keepdims=True)
+    xi, rates, x = _multipliers(asked, told.escape_twist / largest, told.joint_rates / largest)
     speed, size = np.linalg.norm(xi, axis=-1), np.linalg.norm(asked.load, axis=-1)
     blur = np.linalg.norm(known.blocks, axis=(-2, -1)) * speed[:, None]
     blur = blur + np.linalg.norm(jacobian, axis=(-2, -1)) * np.linalg.norm(rates, axis=-1)[:, None]

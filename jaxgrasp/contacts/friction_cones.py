@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax.numpy as jnp
 
 from ..core import Array, Float
@@ -25,6 +26,7 @@ def _split(scaled: Array, index: int) -> tuple[Array, Array]:
     return normal, jnp.sqrt(jnp.maximum(square, 0.0))
 
 
+@eqx.filter_jit
 def cone_use(grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch"]:
     """``max_i psi_i(f_i) / f_n,i``: 0 for normal forces alone, 1 at the edge of friction, infinite beyond all cones."""
     scaled, _, index = _scaled(grasp, force)
@@ -34,6 +36,7 @@ def cone_use(grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*b
     return jnp.max(use, axis=-1)
 
 
+@eqx.filter_jit
 def into_cones(
     grasp: Grasp, force: Float[Array, "*batch kn"], *, cap: Float[Array, "*batch k"] | None = None
 ) -> Float[Array, "*batch kn"]:
@@ -48,6 +51,7 @@ def into_cones(
     return parts.reshape(force.shape)
 
 
+@eqx.filter_jit
 def nearest_admissible(grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch kn"]:
     """The forces in the cones nearest to ``force``, distances measured in (f_x / mu, f_y / mu, f_n, tau_n / gamma).
 

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ..core import Array, ArrayLike, Bool, Float, Index, real_array
+from ..core import Array, ArrayLike, Bool, Float, Index, part_of, real_array, widened
 from .models import ContactModel
 
 __all__ = ["Grasp"]
@@ -29,7 +29,7 @@ def _vectors(value: ArrayLike, name: str) -> Array:
 
 def _per_contact(value: Array, shape: tuple[int, ...], name: str) -> Array:
     try:
-        return jnp.broadcast_to(value, shape)
+        return widened(value, shape)
     except ValueError as error:
         raise ValueError(
             f"{name} must be a number or broadcast to one value per contact, shape {shape}, got {value.shape}"
@@ -77,15 +77,15 @@ class Grasp(eqx.Module):
             ) from error
         model.components(shape[-1])  # a planar soft finger raises here
         dtype = jnp.result_type(position.dtype, normal.dtype)
-        self.position = jnp.broadcast_to(position.astype(dtype), shape)
-        self.normal = jnp.broadcast_to(normal.astype(dtype), shape)
+        self.position = widened(position.astype(dtype), shape)
+        self.normal = widened(normal.astype(dtype), shape)
         contacts = shape[:-1]
         self.model = model.with_coefficients(
             _per_contact(model.friction_coefficient.astype(dtype), contacts, "friction"),
             _per_contact(model.torsion_coefficient.astype(dtype), contacts, "torsion"),
         )
         if active is None:
-            self.active = jnp.ones(contacts, bool)
+            self.active = jnp.asarray(np.ones(contacts, bool))
         else:
             mask = jnp.asarray(active)
             if mask.dtype != jnp.bool_:
@@ -116,11 +116,4 @@ class Grasp(eqx.Module):
         """The grasps at ``index`` of the batch."""
         if not self.batch_shape:
             raise IndexError("a single grasp has no batch axis to index")
-        return Grasp(
-            self.position[index],
-            self.normal[index],
-            self.model.with_coefficients(
-                self.model.friction_coefficient[index], self.model.torsion_coefficient[index]
-            ),
-            self.active[index],
-        )
+        return part_of(self, index)

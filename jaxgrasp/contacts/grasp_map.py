@@ -21,6 +21,7 @@ __all__ = [
 ]
 
 
+@eqx.filter_jit
 def contact_wrenches(
     position: Float[Array, "*batch k d"],
     normal: Float[Array, "*batch k d"],
@@ -75,6 +76,7 @@ def folded_grasp_map(grasp: Grasp) -> Float[Array, "*batch m kn"]:
     return _stacked(grasp, grasp.model.scaling(grasp.dimension))
 
 
+@eqx.filter_jit
 def length_scale(grasp: Grasp) -> Float[Array, "*batch"]:
     """``L = max_i |p_i|`` over the active contacts in m, or 1 where that is zero."""
     squares = jnp.sum(grasp.position**2, axis=-1)

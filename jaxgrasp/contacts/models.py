@@ -84,6 +84,7 @@ class ContactModel(eqx.Module):
         """Position of f_n among the components."""
         return self.components(dimension).index(Component.NORMAL)
 
+    @eqx.filter_jit
     def scaling(self, dimension: int) -> Float[Array, "*contacts n"]:
         """``(mu, mu, 1, gamma)`` in the order of the components: f_j = scaling_j s_j, s in the unit cone."""
         mu, gamma = self.friction_coefficient, self.torsion_coefficient
@@ -95,6 +96,7 @@ class ContactModel(eqx.Module):
         }
         return jnp.stack([by_component[c] for c in self.components(dimension)], axis=-1)
 
+    @eqx.filter_jit
     def friction_function(
         self, force: Float[Array, "*contacts n"], dimension: int
     ) -> Float[Array, "*contacts"]:
@@ -108,12 +110,14 @@ class ContactModel(eqx.Module):
         tangential = jnp.delete(ratio, self.normal_index(dimension), axis=-1)
         return jnp.sqrt(jnp.sum(tangential * tangential, axis=-1))
 
+    @eqx.filter_jit
     def feasibility_slack(
         self, force: Float[Array, "*contacts n"], dimension: int
     ) -> Float[Array, "*contacts"]:
         """``f_n - psi(f)`` in N: positive inside the friction cone."""
         return force[..., self.normal_index(dimension)] - self.friction_function(force, dimension)
 
+    @eqx.filter_jit
     def dual_slack(self, velocity: Float[Array, "*contacts n"], dimension: int) -> Float[Array, "*contacts"]:
         """``x_n - |(mu x_x, mu x_y, gamma x_tau)|``: at least 0 iff no feasible force does negative work.
 

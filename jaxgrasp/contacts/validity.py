@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax.numpy as jnp
 
 from ..core import Array, Bool
@@ -26,6 +27,7 @@ def sound_contacts(
     return usable & points
 
 
+@eqx.filter_jit
 def is_grasp(grasp: Grasp) -> Bool[Array, "*batch"]:
     """Whether at least one contact is active and the numbers of all active ones are sound."""
     position, normal = (

@@ -1,7 +1,7 @@
 """Ground floor: array vocabulary, tolerances by dtype, statuses, rigid-body geometry, errors. It knows no grasp."""
 
 from .answer import Answer
-from .arrays import Array, ArrayLike, Bool, Float, Index, Int, real_array
+from .arrays import Array, ArrayLike, Bool, Float, Index, Int, on_host, real_array, widened
 from .broadcast import spread
 from .errors import UserError
 from .geometry import (
@@ -27,7 +27,7 @@ from .rotations import (
     rotation_between,
     turned,
 )
-from .select import first_of
+from .select import first_of, part_of
 from .status import Status
 from .tolerances import (
     balance_tolerance,
@@ -73,7 +73,9 @@ __all__ = [
     "largest_response",
     "normalize",
     "normalize_components",
+    "on_host",
     "orientation_matrix",
+    "part_of",
     "pivot_tolerance",
     "proven_limit",
     "rank_tolerance",
@@ -90,6 +92,7 @@ __all__ = [
     "turned",
     "unit_roundoff",
     "visibility_tolerance",
+    "widened",
     "widest_scaling",
     "wrench_dimension",
 ]

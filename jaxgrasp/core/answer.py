@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from typing import ClassVar, Self
 
 import equinox as eqx
-import jax
 import numpy as np
 from jax.core import Tracer
 
 from .arrays import Array, Index, Int
+from .select import part_of
 from .status import Status
 
 __all__ = ["Answer"]
@@ -41,7 +41,7 @@ class Answer(eqx.Module):
         """The answers at ``index`` of the batch. IndexError where there is no batch axis."""
         if not self.batch_shape:
             raise IndexError("a single answer has no batch axis to index")
-        return jax.tree.map(lambda x: x[index], self)
+        return part_of(self, index)
 
     def sentence(self, index: int | tuple[int, ...] = ()) -> str:
         """The status of the lane at ``index`` in words: one sentence."""

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from types import EllipsisType
+from typing import Any
 
+import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-__all__ = ["Array", "ArrayLike", "Bool", "Float", "Index", "Int", "real_array"]
+__all__ = ["Array", "ArrayLike", "Bool", "Float", "Index", "Int", "on_host", "real_array", "widened"]
 
 # What a batch is indexed by, as NumPy does it.
 Index = int | slice | EllipsisType | ArrayLike | tuple[int | slice | EllipsisType | ArrayLike, ...]
@@ -25,3 +29,26 @@ def real_array(value: ArrayLike, name: str, means: str = "a number or an array o
     if not jnp.issubdtype(array.dtype, jnp.integer):
         raise ValueError(f"{name} must hold real numbers, got dtype {array.dtype}")
     return array.astype(jnp.result_type(float))
+
+
+def _here(leaf: Any) -> bool:
+    if isinstance(leaf, Tracer):
+        return False
+    return not isinstance(leaf, jax.Array) or all(device.platform == "cpu" for device in leaf.devices())
+
+
+def on_host(tree: Any) -> bool:
+    """Whether NumPy can read all leaves of ``tree`` as they are: known numbers in the CPU's memory.
+
+    Moving numbers about is then NumPy's: JAX would compile a program for each shape.
+    """
+    return all(_here(x) for x in jax.tree.leaves(tree))
+
+
+def widened(value: Array, shape: tuple[int, ...]) -> Array:
+    """``value`` broadcast to ``shape``; ValueError where it does not."""
+    if value.shape == shape:
+        return value
+    if on_host(value):
+        return jnp.asarray(np.broadcast_to(np.asarray(value), shape))
+    return jnp.broadcast_to(value, shape)

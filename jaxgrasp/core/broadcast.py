@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from .arrays import Array
+from .arrays import Array, widened
 
 __all__ = ["spread"]
 
@@ -17,9 +17,11 @@ def spread(
     ValueError with the ``name`` of the value where it does not broadcast.
     """
     try:
-        full = jnp.broadcast_to(value, (*batch, *own))
+        full = widened(jnp.asarray(value), (*batch, *own))
     except ValueError as error:
         raise ValueError(
             f"{name} must broadcast to shape {(*batch, *own)}, got {jnp.shape(value)}"
         ) from error
-    return jnp.broadcast_to(full.reshape(*batch, *([1] * len(loads)), *own), (*batch, *loads, *own))
+    if not loads:
+        return full
+    return widened(full.reshape(*batch, *([1] * len(loads)), *own), (*batch, *loads, *own))

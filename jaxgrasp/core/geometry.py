@@ -6,6 +6,7 @@ coordinates (x, y); their rotations and torques are scalars about +z.
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 
 from .arrays import Array, Float
@@ -43,6 +44,7 @@ def applied(matrix: Float[Array, "*batch m n"], v: Float[Array, "*batch n"]) -> 
     return jnp.sum(matrix * v[..., None, :], axis=-1)
 
 
+@jax.jit
 def skew(v: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
     """``[v]_x`` with ``[v]_x u = v x u``. Same units as ``v``."""
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
@@ -83,6 +85,7 @@ def normalize_components(v: Components) -> Components:
     return tuple(x / length for x in scaled)
 
 
+@jax.jit
 def normalize(v: Float[Array, "*batch d"]) -> Float[Array, "*batch d"]:
     """``v / |v|`` without overflow or underflow; NaN for a zero or non-finite vector."""
     return jnp.stack(normalize_components(components(v)), axis=-1)
@@ -99,6 +102,7 @@ def frame_components(normal: Components) -> tuple[Components, ...]:
     return (1 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
 
 
+@jax.jit
 def contact_frame(normal: Float[Array, "*batch d"]) -> tuple[Float[Array, "*batch d"], ...]:
     """Unit tangents ``t_1 (, t_2)`` with ``t_1 x t_2 = n`` (space) or ``t_1 x n = +e_z`` (plane).
 

@@ -7,6 +7,9 @@ Source: Solà, Deray, Atchuthan, A micro Lie theory for state estimation in robo
 
 from __future__ import annotations
 
+import functools
+
+import jax
 import jax.numpy as jnp
 
 from .arrays import Array, Float
@@ -47,6 +50,7 @@ def quaternion_product(a: Float[Array, "*batch 4"], b: Float[Array, "*batch 4"])
     )
 
 
+@jax.jit
 def orientation_matrix(orientation: Float[Array, "*batch o"]) -> Float[Array, "*batch d d"]:
     """R_WB of an orientation: 3 x 3 for a unit quaternion, 2 x 2 for an angle."""
     if orientation.shape[-1] == 1:
@@ -62,6 +66,7 @@ def orientation_matrix(orientation: Float[Array, "*batch o"]) -> Float[Array, "*
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+@functools.partial(jax.jit, static_argnames="inverse")
 def rotate(
     orientation: Float[Array, "*batch o"], v: Float[Array, "*batch d"], inverse: bool = False
 ) -> Float[Array, "*batch d"]:
@@ -77,6 +82,7 @@ def rotate(
     return v + (-w if inverse else w) * t + cross(u, t)
 
 
+@functools.partial(jax.jit, static_argnames="inverse")
 def rotate_wrench(
     orientation: Float[Array, "*batch o"], wrench: Float[Array, "*batch m"], inverse: bool = False
 ) -> Float[Array, "*batch m"]:
@@ -86,6 +92,7 @@ def rotate_wrench(
     return jnp.concatenate(list(parts), axis=-1)
 
 
+@jax.jit
 def turned(
     orientation: Float[Array, "*batch o"], rotation: Float[Array, "*batch t"]
 ) -> Float[Array, "*batch o"]:
@@ -104,6 +111,7 @@ def turned(
     return product / jnp.sqrt(jnp.sum(product * product, axis=-1, keepdims=True))
 
 
+@jax.jit
 def rotation_between(
     orientation: Float[Array, "*batch o"], reference: Float[Array, "*batch o"]
 ) -> Float[Array, "*batch t"]:
@@ -124,6 +132,7 @@ def rotation_between(
     return v * jnp.where(small, series, 2 * jnp.arctan2(size, w) / size)
 
 
+@jax.jit
 def jacobian_product(
     rotation: Float[Array, "*batch t"], rate: Float[Array, "*batch t"]
 ) -> Float[Array, "*batch t"]:
@@ -145,6 +154,7 @@ def jacobian_product(
     return rate + first * once + second * cross(rotation, once)
 
 
+@jax.jit
 def jacobian_solve(
     rotation: Float[Array, "*batch t"], angular: Float[Array, "*batch t"]
 ) -> Float[Array, "*batch t"]:

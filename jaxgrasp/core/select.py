@@ -1,14 +1,30 @@
-"""A table of (condition, code) read lane by lane."""
+"""What is chosen lane by lane: the code of a table, a part of a batch."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 
-from .arrays import Array
+from .arrays import Array, Index, on_host
 
-__all__ = ["first_of"]
+__all__ = ["first_of", "part_of"]
+
+Batch = TypeVar("Batch")  # a pytree of arrays with the batch axes in front
+
+
+def part_of(batch: Batch, index: Index) -> Batch:
+    """``x[index]`` of every array x of ``batch``, as NumPy indexes. IndexError where there is no such part.
+
+    NumPy does it where it can: it compiles nothing, and refuses an index that is too large.
+    """
+    if not on_host((batch, index)):
+        return jax.tree.map(lambda x: x[index], batch)
+    where = jax.tree.map(lambda i: np.asarray(i) if isinstance(i, jax.Array) else i, index)
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[where]), batch)
 
 
 def first_of(table: Sequence[tuple[Array, int]], otherwise: Array | int) -> Array:

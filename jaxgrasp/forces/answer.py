@@ -138,7 +138,7 @@ def answer(problem: ForceProblem, state: ConvexState, tolerance: Array) -> Answe
     program, load, projection = problem.program, problem.load, problem.tile.projection
     m, dtype = program.rhs.shape[0], problem.tile.folded.norm.dtype
     u = _polished(projection.basis.columns, program.rhs, program.exists, state.point.u)
-    rows, ray = _all_rows(state.point), state.ray
+    rows, ray = _all_rows(state.point), _to_size_one(state.ray)
     values = _values(problem, state.point, u, rows)
 
     found = Multipliers(
@@ -176,6 +176,13 @@ def _proofs(problem: ForceProblem, found: Multipliers) -> Proofs:
 @stage
 def _all_rows(point: ConvexPoint) -> Array:
     return point.rows()
+
+
+@stage
+def _to_size_one(ray: Array) -> Array:
+    """A proof may be scaled by any positive number; the solver's grows until it overflows where it is sought longest."""
+    largest = cone_max(jnp.abs(ray))
+    return ray / jnp.where((largest > 0) & jnp.isfinite(largest), largest, jnp.ones_like(largest))
 
 
 @stage

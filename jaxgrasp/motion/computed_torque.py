@@ -158,6 +158,7 @@ class TrackingError(NamedTuple):
     spin: Array
 
 
+@eqx.filter_jit
 def tracking_error(state: BodyState, reference: Reference) -> TrackingError:
     """``e = (p - p_d; log(R R_d^T))`` and its exact rate ``e' = (v - v_d; J_l(e)^-1 (omega - R R_d^T omega_d))``."""
     d = state.dimension

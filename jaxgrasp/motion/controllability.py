@@ -17,6 +17,8 @@ import math
 from collections.abc import Mapping
 from typing import ClassVar
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -24,7 +26,7 @@ from jax.typing import ArrayLike
 from ..contacts import Grasp
 from ..core import Answer, Array, Float, Int, Status, rank_tolerance, wrench_dimension
 from ..resistance import wrench_resistance
-from .linearization import Scaled, first_order, is_equilibrium, linearize, scaled_system
+from .linearization import Linearization, Scaled, first_order, is_equilibrium, linearize, scaled_system
 from .rigid_body import RigidBody
 
 __all__ = [
@@ -87,6 +89,7 @@ class Controllability(Answer):
         return "" if rank < 0 else f"Rank {rank}, effort {effort:.4g} weights."
 
 
+@jax.jit
 def controllability_matrix(
     A: Float[Array, "*batch s s"], B: Float[Array, "*batch s n"]
 ) -> Float[Array, "*batch s sn"]:
@@ -147,8 +150,13 @@ def controllability(
     """
     linear = linearize(grasp, body, force=force, gravity=gravity, tolerance=tolerance)
     resistance = wrench_resistance(grasp, tolerance=tolerance, verdict_only=True)
-    status = jnp.broadcast_to(resistance.status, linear.status.shape)
-    system = scaled_system(grasp, body, gravity)
+    return _proved(linear, resistance.status, body, scaled_system(grasp, body, gravity))
+
+
+@eqx.filter_jit
+def _proved(linear: Linearization, resistance: Array, body: RigidBody, system: Scaled) -> Controllability:
+    """Ranks, the motions behind them, and what they prove about the equilibrium."""
+    status = jnp.broadcast_to(resistance, linear.status.shape)
     broken = (linear.status == Status.INVALID.value)[..., None, None]
     system = system._replace(B_c=jnp.where(broken, 0.0, system.B_c), A_c=jnp.where(broken, 0.0, system.A_c))
     m, cut = system.A_c.shape[-1], rank_tolerance(system.A_c.dtype)

@@ -99,6 +99,7 @@ def _spread(grasp: Grasp, body: RigidBody) -> tuple[Grasp, RigidBody]:
     return spread, jax.tree.map(lambda x: wide(x.astype(dtype), other), body)
 
 
+@eqx.filter_jit
 def _judged(grasp: Grasp, load: Array, force: Array) -> tuple[Array, Array]:
     """What given forces are, and their slack."""
     d, n = grasp.dimension, grasp.model.force_size(grasp.dimension)
@@ -114,8 +115,8 @@ def _judged(grasp: Grasp, load: Array, force: Array) -> tuple[Array, Array]:
     point = jnp.where(slack > allowed, Status.NON_MARGINAL.value, Status.MARGINAL.value)
     bad = ~balanced | (slack < -allowed)
     point = jnp.where(bad, Status.NOT_BALANCED.value, point).astype(jnp.int32)
-    finite = jnp.all(jnp.isfinite(force), axis=-1)
-    return jnp.where(finite, point, jnp.int32(Status.INVALID.value)), slack
+    sound = jnp.all(jnp.isfinite(force), axis=-1) & is_grasp(grasp)
+    return jnp.where(sound, point, jnp.int32(Status.INVALID.value)), slack
 
 
 def is_equilibrium(point: Int[Array, "*batch"]) -> Bool[Array, "*batch"]:
@@ -123,6 +124,7 @@ def is_equilibrium(point: Int[Array, "*batch"]) -> Bool[Array, "*batch"]:
     return (point == Status.NON_MARGINAL.value) | (point == Status.MARGINAL.value)
 
 
+@eqx.filter_jit
 def first_order(
     A_c: Float[Array, "*batch m m"], B_c: Float[Array, "*batch m n"]
 ) -> tuple[Float[Array, "*batch s s"], Float[Array, "*batch s n"]]:
@@ -151,13 +153,8 @@ def linearize(
     numbers, says so in ``status``; wrong shapes raise ValueError.
     """
     grasp, body = _spread(grasp, body)
-    d, m, dtype = grasp.dimension, wrench_dimension(grasp.dimension), grasp.dtype
-    g = jnp.broadcast_to(gravity_vector(gravity, d, dtype), (*grasp.batch_shape, d))
-    fit = body.valid & jnp.all(jnp.isfinite(g), axis=-1)
-    body = body.where(body.valid)
-    g = jnp.where(jnp.isfinite(g), g, 0.0)
-    weight = body.mass[..., None] * g
-    load = jnp.concatenate([weight, jnp.zeros((*weight.shape[:-1], m - d), dtype)], axis=-1)
+    d, dtype = grasp.dimension, grasp.dtype
+    fit, body, g, load = _weight(body, gravity_vector(gravity, d, dtype))
     if force is None:
         found = equilibrium(grasp, load, tolerance=tolerance)
         point, slack, forces = found.status, found.slack, found.force
@@ -171,21 +168,41 @@ def linearize(
             )
         forces = jnp.broadcast_to(forces, (*grasp.batch_shape, size))
         point, slack = _judged(grasp, load, forces)
-        good = is_grasp(grasp)
-        point = jnp.where(good, point, jnp.int32(Status.INVALID.value))
     point = jnp.where(fit, point, jnp.int32(Status.INVALID.value))
+    return _about(grasp, body, g, point, forces, slack)
+
+
+@eqx.filter_jit
+def _weight(body: RigidBody, gravity: Array) -> tuple[Array, RigidBody, Array, Array]:
+    """Which lanes are fit; body and gravity, harmless where they are not; the body's weight as a load."""
+    d, m = body.dimension, wrench_dimension(body.dimension)
+    g = jnp.broadcast_to(gravity, (*body.batch_shape, d))
+    valid, finite = body.valid, jnp.isfinite(g)
+    g = jnp.where(finite, g, 0.0)
+    body = body.where(valid)
+    weight = body.mass[..., None] * g
+    load = jnp.concatenate([weight, jnp.zeros((*weight.shape[:-1], m - d), g.dtype)], axis=-1)
+    return valid & jnp.all(finite, axis=-1), body, g, load
+
+
+@eqx.filter_jit
+def _about(
+    grasp: Grasp, body: RigidBody, gravity: Array, point: Array, force: Array, slack: Array
+) -> Linearization:
+    """The linearisation where ``point`` is an equilibrium, zeros elsewhere."""
     there = is_equilibrium(point)
-    A, B = first_order(*_blocks(_sound(grasp), body, g))
+    A, B = first_order(*_blocks(_sound(grasp), body, gravity))
     keep = there[..., None, None]
     return Linearization(
         point,
         jnp.where(keep, A, 0.0),
         jnp.where(keep, B, 0.0),
-        jnp.where(there[..., None], forces, 0.0),
+        jnp.where(there[..., None], force, 0.0),
         jnp.where(there, slack, -jnp.inf),
     )
 
 
+@eqx.filter_jit
 def _sound(grasp: Grasp) -> Grasp:
     """The grasp with harmless numbers wherever a contact does not exist or its lane is none: no NaN, no derivative."""
     live = grasp.active & is_grasp(grasp)[..., None]

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -118,6 +119,7 @@ class RigidBody(eqx.Module):
         return self.mass.dtype
 
     @property
+    @jax.jit
     def valid(self) -> Bool[Array, "*batch"]:
         """Whether the numbers are those of a body."""
         finite = jnp.isfinite(self.mass) & jnp.all(jnp.isfinite(self.inertia), axis=(-1, -2))
@@ -136,11 +138,13 @@ class RigidBody(eqx.Module):
         return good
 
     @property
+    @jax.jit
     def gyration_radius(self) -> Float[Array, "*batch"]:
         """``l = sqrt(tr I / m_B)`` in m: the length by which decisions are scaled."""
         return jnp.sqrt(jnp.trace(self.inertia, axis1=-2, axis2=-1) / self.mass)
 
     @property
+    @jax.jit
     def inverse_inertia(self) -> Float[Array, "*batch t t"]:
         """I^-1 in body axes, in closed form: the cross products of its columns over its determinant."""
         if self.dimension == 2:
@@ -149,6 +153,7 @@ class RigidBody(eqx.Module):
         rows = jnp.stack([cross(b, c), cross(c, a), cross(a, b)], axis=-2)
         return rows / jnp.sum(a * cross(b, c), axis=-1)[..., None, None]
 
+    @jax.jit
     def where(self, keep: Bool[Array, "*batch"]) -> RigidBody:
         """This body where ``keep``; elsewhere a unit one, so that no NaN enters a computation."""
         unit = jnp.eye(self.inertia.shape[-1], dtype=self.dtype)
@@ -236,6 +241,7 @@ def gravity_vector(
     return array.astype(dtype)
 
 
+@eqx.filter_jit
 def mass_matrix(body: RigidBody, orientation: Float[Array, "*batch o"]) -> Float[Array, "*batch m m"]:
     """``M(q) = [[m_B I, 0], [0, I^W]]`` (11.22), ``I^W = R I^B R^T``; kg and kg m^2."""
     d, t = body.dimension, body.inertia.shape[-1]
@@ -251,6 +257,7 @@ def mass_matrix(body: RigidBody, orientation: Float[Array, "*batch o"]) -> Float
     return jnp.concatenate([upper, lower], axis=-2)
 
 
+@eqx.filter_jit
 def coriolis(body: RigidBody, state: BodyState) -> Float[Array, "*batch m"]:
     """``B(q, q') = (0; omega x I^W omega)`` (11.22), N and N m; zero in the plane."""
     d = state.dimension
@@ -264,6 +271,7 @@ def coriolis(body: RigidBody, state: BodyState) -> Float[Array, "*batch m"]:
     return jnp.concatenate([jnp.zeros_like(torque), torque], axis=-1)
 
 
+@eqx.filter_jit
 def gravity_term(
     body: RigidBody, *, gravity: Float[ArrayLike, "*batch d"] | None = None
 ) -> Float[Array, "*batch m"]:
@@ -276,6 +284,7 @@ def gravity_term(
     )
 
 
+@eqx.filter_jit
 def world_grasp_map(grasp: Grasp, orientation: Float[Array, "*batch o"]) -> Float[Array, "*batch m kn"]:
     """``G^W(q) = diag(R, R) G`` (11.23): contact forces, which turn with the body, to the wrench in world axes."""
     G, d = grasp_map(grasp), grasp.dimension
@@ -284,6 +293,7 @@ def world_grasp_map(grasp: Grasp, orientation: Float[Array, "*batch o"]) -> Floa
     return jnp.concatenate([R @ G[..., :d, :], torque], axis=-2)
 
 
+@eqx.filter_jit
 def acceleration(
     body: RigidBody,
     state: BodyState,
@@ -305,6 +315,7 @@ def acceleration(
     )
 
 
+@eqx.filter_jit
 def advance(
     body: RigidBody,
     state: BodyState,

@@ -9,9 +9,11 @@ implicit function, d alpha* = -(dt* / dtheta) / (dt* / dalpha) dtheta, and of an
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +22,7 @@ from jax.typing import ArrayLike
 
 from ..backend import is_traced
 from ..contacts import ContactModel, Grasp
-from ..core import Answer, Array, Float, Int, Status
+from ..core import Answer, Array, Float, Int, Status, wrench_dimension
 from ..resistance import WrenchResistance, wrench_resistance
 
 __all__ = ["CriticalFriction", "critical_friction", "friction_sweep", "with_friction_factor"]
@@ -60,8 +62,12 @@ class CriticalFriction(Answer):
 
 def with_friction_factor(grasp: Grasp, factor: Float[ArrayLike, "*batch"]) -> Grasp:
     """The grasp with ``factor * mu`` for every mu, gamma unchanged; ``factor`` a number or one a grasp."""
-    scale = jnp.asarray(factor, grasp.dtype)
-    scale = jnp.broadcast_to(scale, grasp.batch_shape)[..., None]
+    return _rougher(grasp, jnp.asarray(factor, grasp.dtype))
+
+
+@eqx.filter_jit
+def _rougher(grasp: Grasp, factor: Array) -> Grasp:
+    scale = jnp.broadcast_to(factor, grasp.batch_shape)[..., None]
     model = grasp.model
     changed = model.with_coefficients(scale * model.friction_coefficient, model.torsion_coefficient)
     return Grasp(grasp.position, grasp.normal, changed, grasp.active)
@@ -94,17 +100,20 @@ class _Bracket(NamedTuple):
 def _margin(grasp: Grasp, log_factor: Array) -> Array:
     """t* at a factor, at least -1 and not 0; -1 as well where the rank rules resistance out."""
     verdict = wrench_resistance(with_friction_factor(grasp, jnp.exp(log_factor)))
-    margin = jnp.where(
-        verdict.status == Status.RESISTANT.value, verdict.margin, jnp.minimum(verdict.margin, -1e-12)
-    )
-    deficient = (verdict.rank >= 0) & (verdict.rank < grasp.dimension * (grasp.dimension + 1) // 2)
-    return jnp.where(deficient, -1.0, jnp.maximum(margin, -1.0))
+    return _kept(verdict.status, verdict.lower, verdict.rank, wrench_dimension(grasp.dimension))
+
+
+@functools.partial(jax.jit, static_argnames="full")
+def _kept(status: Array, margin: Array, rank: Array, full: int) -> Array:
+    margin = jnp.where(status == Status.RESISTANT.value, margin, jnp.minimum(margin, -1e-12))
+    return jnp.where((rank >= 0) & (rank < full), -1.0, jnp.maximum(margin, -1.0))
 
 
 def _width(dtype) -> float:
     return 5e-7 if jnp.dtype(dtype).itemsize == 8 else 1e-3
 
 
+@functools.partial(jax.jit, static_argnames="width")
 def _next(bracket: _Bracket, width: float) -> Array:
     """The middle of the first rounds and of every other one; between them the secant, pushed past the root.
 
@@ -120,6 +129,7 @@ def _next(bracket: _Bracket, width: float) -> Array:
     return jnp.where(bisect, middle, inside)
 
 
+@functools.partial(jax.jit, static_argnames="width")
 def _advance(bracket: _Bracket, at: Array, value: Array, width: float) -> _Bracket:
     """The bracket with one end at ``at``; the margin of an end that stays a second time is halved (Illinois)."""
     open_ = bracket.high - bracket.low > width
@@ -140,22 +150,39 @@ def _search(grasp: Grasp, loop: Callable[..., Any]) -> tuple[Array, Array]:
     """
     shape, dtype = grasp.batch_shape, grasp.dtype
     width = _width(dtype)
-    low, high = jnp.full(shape, jnp.log(LEAST), dtype), jnp.full(shape, jnp.log(MOST), dtype)
+    low, high = (jnp.asarray(np.full(shape, np.log(x)), dtype) for x in (LEAST, MOST))
     below, above = _margin(grasp, low), _margin(grasp, high)
-    invalid, always, never = jnp.isnan(above), below > 0, ~(above > 0)
-    at_low = jnp.where(always | never, high, low)  # closed at once
-    zero = jnp.zeros(shape, jnp.int32)
-    start = _Bracket(at_low, high, jnp.where(always, -1.0, below), jnp.where(never, 1.0, above), zero, zero)
+    start = _begin(low, high, below, above)
 
     def unfinished(bracket: _Bracket) -> Array:
-        return jnp.any((bracket.high - bracket.low > width) & (bracket.round < ROUNDS))
+        return _open(bracket, width)
 
     def step(bracket: _Bracket) -> _Bracket:
         at = _next(bracket, width)
         return _advance(bracket, at, _margin(grasp, at), width)
 
-    end = loop(unfinished, step, start)
-    nan = jnp.where(invalid, jnp.nan, jnp.zeros_like(above))
+    return _ends(loop(unfinished, step, start), below, above)
+
+
+@jax.jit
+def _begin(low: Array, high: Array, below: Array, above: Array) -> _Bracket:
+    """Between ``low`` and ``high``; closed at once where even the least friction will do, or the most does not."""
+    always, never = below > 0, ~(above > 0)
+    zero = jnp.zeros(low.shape, jnp.int32)
+    at_low = jnp.where(always | never, high, low)
+    return _Bracket(at_low, high, jnp.where(always, -1.0, below), jnp.where(never, 1.0, above), zero, zero)
+
+
+@functools.partial(jax.jit, static_argnames="width")
+def _open(bracket: _Bracket, width: float) -> Array:
+    return jnp.any((bracket.high - bracket.low > width) & (bracket.round < ROUNDS))
+
+
+@jax.jit
+def _ends(end: _Bracket, below: Array, above: Array) -> tuple[Array, Array]:
+    """Both ends, from the bracket and the margins at the least and the most friction."""
+    always, never = below > 0, ~(above > 0)
+    nan = jnp.where(jnp.isnan(above), jnp.nan, jnp.zeros_like(above))
     lower = jnp.where(always, -jnp.inf, jnp.where(never, jnp.log(MOST), end.low))
     upper = jnp.where(always, jnp.log(LEAST), jnp.where(never, jnp.inf, end.high))
     return lower + nan, upper + nan
@@ -189,7 +216,12 @@ def _grasp(data: _Data, model: ContactModel, active: Array) -> Grasp:
 def _critical(data: _Data, model: ContactModel, active: Array) -> tuple[Array, Array, Array]:
     grasp = _grasp(data, model, active)
     traced = is_traced(grasp)
-    low, high = _search(grasp, lax.while_loop if traced else _python_loop)
+    return _factors(*_search(grasp, lax.while_loop if traced else _python_loop))
+
+
+@jax.jit
+def _factors(low: Array, high: Array) -> tuple[Array, Array, Array]:
+    """The factor and its bracket from the logarithms of both ends."""
     lower, upper = jnp.exp(low), jnp.exp(high)
     factor = jnp.exp((low + high) / 2)
     factor = jnp.where(jnp.isneginf(low), 0.0, jnp.where(jnp.isposinf(high), jnp.inf, factor))
@@ -227,7 +259,11 @@ def critical_friction(grasp: Grasp) -> CriticalFriction:
     if not isinstance(grasp, Grasp):
         raise ValueError(f"critical_friction takes a jaxgrasp.Grasp, got {type(grasp).__name__}")
     still = jax.tree.map(lax.stop_gradient, grasp)
-    factor, lower, upper = _critical(_data(grasp), still.model, grasp.active)
+    return _answer(*_critical(_data(grasp), still.model, grasp.active))
+
+
+@jax.jit
+def _answer(factor: Array, lower: Array, upper: Array) -> CriticalFriction:
     status = jnp.where(upper <= 1, Status.RESISTANT.value, Status.MARGINAL.value)
     status = jnp.where(lower >= 1, Status.NOT_RESISTANT.value, status)
     status = jnp.where(jnp.isnan(factor), Status.INVALID.value, status).astype(jnp.int32)

@@ -26,7 +26,7 @@ from ..backend import batched, in_chunks, is_traced, map_tiles
 from ..certificates import check_epsilon, checked_by
 from ..contacts import Grasp
 from ..core import Answer, Array, Bool, Float, Int, Status
-from ..resistance import wrench_resistance
+from ..resistance import WrenchResistance, wrench_resistance
 from .polytope import Capacity, Polytope, begin, grow, widen
 from .unit_wrench_space import NORMS, effort_map, extreme_force, scaled, support, torque_lengths
 from .weakest_direction import Touch, weakest_direction
@@ -257,10 +257,19 @@ def epsilon_quality(
     goal = jnp.asarray(tolerance, grasp.dtype)
     traced = is_traced((rows, goal))
     found = _compiled(plan)(rows, goal) if traced else _on_host(plan, rows, goal)
+    return _answer(grasp, verdict, A, length, found, norm)
 
+
+@eqx.filter_jit
+def _answer(
+    grasp: Grasp, verdict: WrenchResistance, A: Array, length: Array, found: _Found, norm: str
+) -> EpsilonQuality:
+    """Both bounds with the derivative of epsilon; what is known of a grasp that is not resistant."""
+    still: Any = jax.tree.map(lax.stop_gradient, grasp)
+    resistant = verdict.status == Status.RESISTANT.value
     away = _unresisted(grasp, verdict.escape_twist, lax.stop_gradient(length))
     direction = jnp.where(resistant[..., None], found.direction, away)
-    edge = _supports(rows.A, grasp.active, norm, direction)
+    edge = _supports(lax.stop_gradient(A), grasp.active, norm, direction)
     lower = _bound(verdict.status, found.lower, jnp.zeros_like(edge))
     upper = _bound(verdict.status, found.upper, edge)
     # d(epsilon) = d . dA f with the touching wrench's d and f held, by the envelope theorem

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
@@ -14,6 +15,7 @@ from .unit_wrench_space import torque_lengths
 __all__ = ["grasp_isotropy", "grasp_volume"]
 
 
+@eqx.filter_jit
 def _singular_values(grasp: Grasp, torque_scale: Any) -> Array:
     m = wrench_dimension(grasp.dimension)
     length = torque_lengths(grasp, torque_scale)

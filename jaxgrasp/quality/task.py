@@ -10,6 +10,7 @@ that cannot squeeze may score well; they are here for comparison. Sources: Polla
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
@@ -55,7 +56,13 @@ def task_quality(
         raise ValueError(f"norm must be one of {', '.join(NORMS)}, got {norm!r}")
     criterion = SmallestSum() if norm == "L1" else Gentlest()
     held = resistible_wrenches(grasp, wrenches, criterion=criterion, tolerance=tolerance)
-    status, cost = held.status, held.forces.cost
+    return _worst_of(held.status, held.forces)
+
+
+@eqx.filter_jit
+def _worst_of(status: Array, forces: OptimalForces) -> TaskQuality:
+    """The quality of a task from the forces of its wrenches."""
+    cost = forces.cost
     effort = jnp.where(status == Status.OPTIMAL.value, cost, jnp.inf)
     most = jnp.max(effort, axis=-1)
     multiple = jnp.where(jnp.isfinite(most) & (most > 0), 1 / jnp.where(most > 0, most, 1.0), 0.0)
@@ -63,7 +70,7 @@ def task_quality(
     invalid = jnp.any(status == Status.INVALID.value, axis=-1)
     worst = jnp.argmax(effort, axis=-1).astype(jnp.int32)
     multiple = jnp.where(invalid, jnp.nan, multiple)
-    return TaskQuality(_whole(status), multiple, effort, worst, held.forces)
+    return TaskQuality(_whole(status), multiple, effort, worst, forces)
 
 
 def _whole(status: Array) -> Array:

@@ -11,6 +11,7 @@ every contact is the unit cone, so h_i = v_0 + |v_t| with v = A_i^T d; no cone i
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
@@ -50,6 +51,7 @@ def torque_lengths(
         ) from error
 
 
+@eqx.filter_jit
 def effort_map(grasp: Grasp, length: Float[Array, "*batch"]) -> Float[Array, "*batch k m n"]:
     """``A_i``: scaled contact forces, normal component first, to wrenches (F; tau / length). Zero where inactive."""
     m, n = wrench_dimension(grasp.dimension), grasp.model.force_size(grasp.dimension)
@@ -61,6 +63,7 @@ def effort_map(grasp: Grasp, length: Float[Array, "*batch"]) -> Float[Array, "*b
     return blocks[..., order]
 
 
+@eqx.filter_jit
 def scaled(grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch k n"]:
     """s with f = (mu, mu, 1, gamma) s, normal component first; 0 where a component does not exist."""
     scale = grasp.model.scaling(grasp.dimension)
@@ -97,6 +100,7 @@ def support(A: Array, active: Array, norm: str, direction: Array) -> tuple[Array
     return value, jnp.einsum("kmn,kn->m", A, force), force
 
 
+@eqx.filter_jit
 def signed_supports(
     A: Float[Array, "*batch k m n"],
     active: Bool[Array, "*batch k"],

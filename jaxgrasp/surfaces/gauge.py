@@ -110,13 +110,21 @@ class Gauge(Surface):
         slope = jax.grad(self.gauge)(x - self.centre)
         return -slope / jnp.sqrt(jnp.sum(slope * slope))
 
+    @eqx.filter_jit
+    def _values(self, points: Float[Array, "N 3"]) -> Float[Array, " N"]:
+        return jax.vmap(self.gauge)(points)
+
+    @eqx.filter_jit
+    def _slopes(self, points: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
+        return jax.vmap(jax.grad(self.gauge))(points)
+
     def _stretch(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Points of the surface over unit directions u, and their area for each area of the unit sphere."""
         semiaxes = np.asarray(self.semiaxes, np.float64)
         out = jnp.asarray(semiaxes * u, self.semiaxes.dtype)
-        value = np.asarray(jax.jit(jax.vmap(self.gauge))(out), np.float64)
+        value = np.asarray(self._values(out), np.float64)
         x = np.asarray(out, np.float64) / value[:, None]
-        slope = np.asarray(jax.jit(jax.vmap(jax.grad(self.gauge)))(jnp.asarray(x, out.dtype)), np.float64)
+        slope = np.asarray(self._slopes(jnp.asarray(x, out.dtype)), np.float64)
         # The cone over a piece of the surface has a third of area times height n . x = 1 / |grad F|.
         return x, semiaxes.prod() / value**3 * np.linalg.norm(slope, axis=1)
 
@@ -131,8 +139,7 @@ class Gauge(Surface):
             found.append(kept)
             have += len(kept)
         x = np.concatenate(found)[:count]
-        slope = jax.jit(jax.vmap(jax.grad(self.gauge)))(jnp.asarray(x, self.semiaxes.dtype))
-        outward = np.array(slope, np.float64)
+        outward = np.array(self._slopes(jnp.asarray(x, self.semiaxes.dtype)), np.float64)
         outward /= np.linalg.norm(outward, axis=1, keepdims=True)
         return np.asarray(self.centre, np.float64) + x, -outward
 
