@@ -1,5 +1,6 @@
 """``jaxgrasp place`` as a user runs it."""
 
+import functools
 import importlib
 
 import jax
@@ -11,6 +12,7 @@ import pytest
 import jaxgrasp as jg
 from jaxgrasp.cli.main import main
 from jaxgrasp.formats import ContactFile, read_metadata, read_row
+from jaxgrasp.placement import Search
 from jaxgrasp.placement.requirements import SLACK
 
 # The rooms have functions of the same names.
@@ -119,12 +121,11 @@ def test_the_same_seed_gives_the_same_bytes(placed, tmp_path):
 @pytest.mark.slow("test_the_grasps_in_the_file_hold_when_solved_again")
 @pytest.mark.parametrize(
     "objective",
-    [
-        "epsilon",
-        "epsilon-linf",
-    ],
+    ["epsilon", "epsilon-linf"],
 )
-def test_every_objective_grows(objective, tmp_path):
+def test_every_objective_grows(objective, monkeypatch, tmp_path):
+    """On the climb alone: settling, which comes after it, finds as much from a poorer start by luck."""
+    monkeypatch.setattr(placing, "Search", functools.partial(Search, settling=0))
     words = ["place", "box", "--starts", "8", "--resolution", "32", "--best", "4", "--objective", objective]
     value = []
     for steps in ("1", "20"):
