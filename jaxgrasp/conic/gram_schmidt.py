@@ -7,25 +7,42 @@ Parlett: twice is enough).
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 
 from ..backend import stage
 from ..core import Array
 from .cholesky import Cholesky
 from .cone import Cone, cone_sum
-from .products import Vector, matvec
+from .products import Vector
 
 __all__ = ["orthonormal_rows"]
 
 
-def _inner_product(x: Cone, y: Cone) -> Array:
-    """``x.y``; the arrays may be of different heights."""
-    return cone_sum(jnp.concatenate([a * b for a, b in zip(x, y, strict=True)]))
+@stage
+def _stacked(columns: Cone) -> Array:
+    """(m, K, L): the columns of all components side by side."""
+    return jnp.concatenate(columns, axis=1)
 
 
 @stage
-def _row_norm(row: Cone, floor: Array) -> tuple[Array, Array]:
-    square = _inner_product(row, row)
-    norm = jnp.sqrt(square)
+def _overlaps(rows: list[Array], rest: Array) -> Array:
+    """``<q, r>`` (i, L) of the rows q found so far with the next remainder r."""
+    return jnp.stack([cone_sum(row * rest[0]) for row in rows])
+
+
+@stage
+def _reorthogonalized(rows: list[Array], rest: Array, overlaps: Array) -> Array:
+    """``r - sum_q <q, r> q``."""
+    remainder = rest[0]
+    for i, row in enumerate(rows):
+        remainder = remainder - overlaps[i] * row
+    return remainder
+
+
+@stage
+def _row_norm(remainder: Array, floor: Array) -> tuple[Array, Array]:
+    """The norm and its reciprocal; both 0 where the norm is not above ``floor``."""
+    norm = jnp.sqrt(cone_sum(remainder * remainder))
     independent = norm > floor
     zero, one = jnp.zeros_like(norm), jnp.ones_like(norm)
     reciprocal = 1 / jnp.where(independent, norm, one)
@@ -33,30 +50,28 @@ def _row_norm(row: Cone, floor: Array) -> tuple[Array, Array]:
 
 
 @stage
-def _row_scaled(row: Cone, factor: Array) -> Cone:
-    return tuple(x * factor for x in row)
-
-
-_products_below = stage(matvec)
+def _row(remainder: Array, reciprocal: Array) -> Array:
+    return remainder * reciprocal
 
 
 @stage
-def _inner_products(rows: list[Cone], head: Cone) -> Vector:
-    return tuple(_inner_product(row, head) for row in rows)
+def _products_below(rest: Array, row: Array) -> Array:
+    """``<r, row>`` of the remainders below (m - 1 - i, L)."""
+    total = rest[1:, 0] * row[0]
+    for i in range(1, row.shape[0]):
+        total = total + rest[1:, i] * row[i]
+    return total
 
 
 @stage
-def _reorthogonalized(rows: list[Cone], head: Cone, products: Vector) -> Cone:
-    """``head - sum_q <q, head> q`` over the rows q found so far."""
-    for row, product in zip(rows, products, strict=True):
-        head = tuple(x - product * q for x, q in zip(head, row, strict=True))
-    return head
+def _projected_out(rest: Array, row: Array, products: Array) -> Array:
+    """The remainders below without their component along ``row``."""
+    return rest[1:] - products[:, None] * row[None]
 
 
 @stage
-def _projected_out(row: Cone, below: Cone, products: Array) -> Cone:
-    """The rows below without their component along ``row``."""
-    return tuple(rest - products[:, None] * x[None] for x, rest in zip(row, below, strict=True))
+def _column(norm: Array, products: Array) -> Array:
+    return jnp.concatenate([norm[None], products])
 
 
 def orthonormal_rows(columns: Cone, floor: Array | Vector) -> tuple[Cone, Cholesky]:
@@ -64,32 +79,38 @@ def orthonormal_rows(columns: Cone, floor: Array | Vector) -> tuple[Cone, Choles
 
     A row whose remainder is not longer than ``floor`` (one for all, or one a row) depends on those above it and becomes
     zero. Each remainder is cleared of the rows above once more: twice is enough (Kahan, Parlett) for orthogonality to
-    rounding.
+    rounding. The components stand side by side in one array: compiling costs a fusion an array.
     """
     m = columns[0].shape[0]
     floors = floor if isinstance(floor, tuple) else (floor,) * m
-    rest: Cone = columns
-    rows: list[Cone] = []
+    rest = _stacked(columns)
+    rows: list[Array] = []
     lower: list[Array] = []
     inverse: list[Array] = []
     for i in range(m):
-        head: Cone = tuple(c[0] for c in rest)
-        if rows:
-            head = _reorthogonalized(rows, head, _inner_products(rows, head))
-        norm, reciprocal = _row_norm(head, floors[i])
-        row = _row_scaled(head, reciprocal)
-        below = tuple(c[1:] for c in rest)
+        remainder = _reorthogonalized(rows, rest, _overlaps(rows, rest)) if rows else rest[0]
+        norm, reciprocal = _row_norm(remainder, floors[i])
+        row = _row(remainder, reciprocal)
         if i < m - 1:
-            products = _products_below(below, row)
-            rest = _projected_out(row, below, products)
-            lower.append(jnp.concatenate([norm[None], products]))
+            products = _products_below(rest, row)
+            rest = _projected_out(rest, row, products)
+            lower.append(_column(norm, products))
         else:
             lower.append(norm[None])
         rows.append(row)
         inverse.append(reciprocal)
-    return _stacked(rows), Cholesky(tuple(lower), tuple(inverse))
+    return _apart(rows, [c.shape[1] for c in columns]), Cholesky(tuple(lower), tuple(inverse))
 
 
-@stage
-def _stacked(rows: list[Cone]) -> Cone:
-    return tuple(jnp.stack(parts) for parts in zip(*rows, strict=True))
+def _apart(rows: list[Array], heights: list[int]) -> Cone:
+    """The rows as d arrays (m, k, L) again."""
+    ends = np.cumsum(heights)
+
+    @stage
+    def run(rows: list[Array]) -> Cone:
+        return tuple(
+            jnp.stack([row[end - height : end] for row in rows])
+            for end, height in zip(ends, heights, strict=True)
+        )
+
+    return run(rows)

@@ -180,7 +180,7 @@ def _all_rows(point: ConvexPoint) -> Array:
 
 @stage
 def _to_size_one(ray: Array) -> Array:
-    """A proof may be scaled by any positive number; the solver's grows until it overflows where it is sought longest."""
+    """A proof may be scaled by any positive number; the solver's grows, and may overflow, as long as it is sought."""
     largest = cone_max(jnp.abs(ray))
     return ray / jnp.where((largest > 0) & jnp.isfinite(largest), largest, jnp.ones_like(largest))
 
