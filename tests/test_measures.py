@@ -3,15 +3,28 @@
 import numpy as np
 import pytest
 from grasps import ball
+from shapes import PLANAR
 
 import jaxgrasp as jg
+
+PAIR = np.array([[-1.0, 0.0], [1.0, 0.0]])
+
+
+def pinch(normal):
+    """Two planar fingers, padded to the shape that tests share."""
+    rest = np.zeros((PLANAR - 2, 2))
+    return jg.Grasp(
+        np.concatenate([PAIR, rest]),
+        np.concatenate([normal, rest + 1]),
+        jg.HardFinger(0.4),
+        np.arange(PLANAR) < 2,
+    )
 
 
 @pytest.mark.parametrize(("norm", "effort"), [("L1", 1.0), ("Linf", 0.5)])
 def test_a_planar_pinch_lifts(norm, effort):
     """Two opposite planar fingers hold a weight w with w / (2 mu) each: effort w / mu in sum, w / (2 mu) at most."""
-    position = np.array([[-1.0, 0.0], [1.0, 0.0]])
-    grasp = jg.Grasp(position, -position, jg.HardFinger(0.4))
+    grasp = pinch(-PAIR)
     loads = np.array([[0.0, -1.0, 0.0], [0.0, -3.0, 0.0], [0.0, 2.0, 0.0]])
     out = jg.task_quality(grasp, loads, norm=norm)
     np.testing.assert_allclose(out.effort, effort * np.array([1.0, 3.0, 2.0]) / 0.4, rtol=1e-6)
@@ -22,8 +35,7 @@ def test_a_planar_pinch_lifts(norm, effort):
 
 
 def test_what_cannot_be_held_has_no_multiple():
-    position = np.array([[-1.0, 0.0], [1.0, 0.0]])
-    shelf = jg.Grasp(position, np.array([[0.0, 1.0], [0.0, 1.0]]), jg.HardFinger(0.4))
+    shelf = pinch(np.array([[0.0, 1.0], [0.0, 1.0]]))
     out = jg.task_quality(shelf, np.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]]))
     assert float(out.multiple) == 0
     assert np.isfinite(np.asarray(out.effort)).tolist() == [True, False]

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from shapes import SOFT
 
 import jaxgrasp as jg
 from jaxgrasp import Status
@@ -55,13 +56,14 @@ def answers(dtype):
     """Wrench resistance of a pinch that holds, one that does not, and one that is no grasp."""
     position = np.array([[[-1, 0, 0], [1, 0, 0]]] * 3, dtype)
     normal = np.array([[[1, 0, 0], [-1, 0, 0]], [[1, 0, 0], [1, 0, 0]], [[0, 0, 0], [0, 0, 0]]], dtype)
-    return jg.wrench_resistance(jg.Grasp(position, normal, jg.SoftFinger(0.5, 0.1)))
+    position, normal = (np.pad(x, [(0, 0), (0, SOFT - 2), (0, 0)]) for x in (position, normal))
+    return jg.wrench_resistance(jg.Grasp(position, normal, jg.SoftFinger(0.5, 0.1), np.arange(SOFT) < 2))
 
 
 def test_an_answer_is_indexed_like_an_array(answers):
     one, some = answers[0], answers[answers.status != Status.INVALID]
     assert one.status.shape == () and one.batch_shape == ()
-    assert some.batch_shape == (2,) and some.internal_force.shape == (2, 8)
+    assert some.batch_shape == (2,) and some.internal_force.shape == (2, 4 * SOFT)
     np.testing.assert_array_equal(some.lower, answers.lower[:2])
     with pytest.raises(IndexError, match="single answer"):
         one[0]

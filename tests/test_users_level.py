@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from grasps import ball
-from shapes import HARD
+from grasps import ball, random_contacts
+from shapes import HARD, PLANAR
 from smooth_problems import as_arrays, direction, grasp_of, planar_problem
 
 import jaxgrasp as jg
@@ -41,8 +41,12 @@ def test_margins(grasp):
     assert jg.check(grasp, users).all()
 
 
-def test_forces(grasp):
-    load, asked = np.random.default_rng(7).normal(size=(200, 6)), jg.Gentlest()
+def test_forces():
+    """In the plane: the kernel is the same, and compiles in a third of the time."""
+    rng = np.random.default_rng(7)
+    position, normal, _ = random_contacts(rng, 200, PLANAR, 2)
+    grasp = jg.Grasp(position, normal, jg.HardFinger(rng.uniform(0.3, 0.8, (200, PLANAR))))
+    load, asked = rng.normal(size=(200, 3)), jg.Gentlest()
     users = at_users_level(
         lambda g, w: jg.optimize_forces(g, w, criterion=asked, tolerance=TOLERANCE), grasp, load
     )

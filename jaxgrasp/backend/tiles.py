@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
 
-from ..core import Array
+from ..core import Array, placed
 from .xla import kernel
 
 __all__ = [
@@ -226,10 +226,10 @@ def in_chunks(solve: Callable[[Any, Array], Any], rows: Any, batch: tuple[int, .
                 return piece
             return np.concatenate([piece, np.zeros((chunk - count, *x.shape[1:]), x.dtype)])
 
-        result = solve(jax.tree.map(part, flat), jnp.int32(count))
+        result = solve(jax.tree.map(part, flat), placed(np.asarray(count, np.int32)))
         results.append(jax.tree.map(lambda x, c=count: np.asarray(x)[:c], result))
     joined = jax.tree.map(lambda *parts: np.concatenate(parts) if parts[1:] else parts[0], *results)
-    return jax.tree.map(lambda x: jnp.asarray(x.reshape((*batch, *x.shape[1:]))), joined)
+    return jax.tree.map(lambda x: placed(x.reshape((*batch, *x.shape[1:]))), joined)
 
 
 def batched(

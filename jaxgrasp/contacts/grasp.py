@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ..core import Array, ArrayLike, Bool, Float, Index, part_of, real_array, widened
+from ..core import Array, ArrayLike, Bool, Float, Index, part_of, placed, real_array, widened
 from .models import ContactModel
 
 __all__ = ["Grasp"]
@@ -85,7 +85,7 @@ class Grasp(eqx.Module):
             _per_contact(model.torsion_coefficient.astype(dtype), contacts, "torsion"),
         )
         if active is None:
-            self.active = jnp.asarray(np.ones(contacts, bool))
+            self.active = placed(np.ones(contacts, bool))
         else:
             mask = jnp.asarray(active)
             if mask.dtype != jnp.bool_:

@@ -16,7 +16,7 @@ from enum import Enum
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..core import Array, ArrayLike, Float, real_array
+from ..core import Array, ArrayLike, Float, real_array, uniform
 
 __all__ = [
     "Component",
@@ -165,29 +165,31 @@ class Frictionless(ContactModel):
     @property
     def friction_coefficient(self) -> Float[Array, "*contacts"]:
         """``mu = 0``, no unit."""
-        return jnp.zeros_like(self.zero)
+        return uniform(self.zero.shape, 0.0, self.zero.dtype)
 
     @property
     def torsion_coefficient(self) -> Float[Array, "*contacts"]:
         """``gamma = 0``, m."""
-        return jnp.zeros_like(self.zero)
+        return uniform(self.zero.shape, 0.0, self.zero.dtype)
 
     def with_coefficients(
         self, friction: Float[Array, "*contacts"], torsion: Float[Array, "*contacts"]
     ) -> Frictionless:
         """A frictionless model in the shape of ``friction``; both coefficients stay 0."""
-        return Frictionless(jnp.zeros_like(friction))
+        return Frictionless(uniform(friction.shape, 0.0, friction.dtype))
 
+    @eqx.filter_jit
     def lmi_matrices(self, dimension: int) -> Float[Array, "*contacts 1 1 1"]:
         """``S = [[1]]``: P(f) = f_n."""
         return jnp.ones((*self.zero.shape, 1, 1, 1), self.zero.dtype)
 
+    @eqx.filter_jit
     def log_det_terms(
         self, dimension: int
     ) -> tuple[Float[Array, "*contacts"], Float[Array, "*contacts"], Float[Array, "*contacts"]]:
         """``log f_n``: (1, 0, 0)."""
-        zero = jnp.zeros_like(self.zero)
-        return zero + 1, zero, zero
+        one, zero = (uniform(self.zero.shape, x, self.zero.dtype) for x in (1.0, 0.0))
+        return one, zero, zero
 
 
 class HardFinger(ContactModel):
@@ -215,7 +217,7 @@ class HardFinger(ContactModel):
     @property
     def torsion_coefficient(self) -> Float[Array, "*contacts"]:
         """``gamma = 0``, m."""
-        return jnp.zeros_like(self.friction)
+        return uniform(self.friction.shape, 0.0, self.friction.dtype)
 
     def with_coefficients(
         self, friction: Float[Array, "*contacts"], torsion: Float[Array, "*contacts"]
@@ -223,6 +225,7 @@ class HardFinger(ContactModel):
         """Hard fingers with mu = ``friction``; gamma stays 0."""
         return HardFinger(friction)
 
+    @eqx.filter_jit
     def lmi_matrices(self, dimension: int) -> Float[Array, "*contacts n q q"]:
         """(11.4): ``[[mu f_n, 0, f_x], [0, mu f_n, f_y], [f_x, f_y, mu f_n]]``; its 2 x 2 form in the plane.
 
@@ -233,6 +236,7 @@ class HardFinger(ContactModel):
         diagonal = jnp.where(mu > 0, mu, jnp.ones_like(mu))
         return _arrow_matrices([tangent] * (dimension - 1), diagonal, self.normal_index(dimension))
 
+    @eqx.filter_jit
     def log_det_terms(
         self, dimension: int
     ) -> tuple[Float[Array, "*contacts"], Float[Array, "*contacts"], Float[Array, "*contacts"]]:
@@ -283,6 +287,7 @@ class SoftFinger(ContactModel):
         """Soft fingers with mu = ``friction`` and gamma = ``torsion`` in m."""
         return SoftFinger(friction, torsion)
 
+    @eqx.filter_jit
     def lmi_matrices(self, dimension: int) -> Float[Array, "*contacts 4 4 4"]:
         """(11.35): ``f_n I`` with ``f_x / mu, f_y / mu, tau_n / gamma`` in the last row and column.
 
@@ -294,6 +299,7 @@ class SoftFinger(ContactModel):
         ]
         return _arrow_matrices(inverses, jnp.ones_like(self.friction), self.normal_index(dimension))
 
+    @eqx.filter_jit
     def log_det_terms(
         self, dimension: int
     ) -> tuple[Float[Array, "*contacts"], Float[Array, "*contacts"], Float[Array, "*contacts"]]:

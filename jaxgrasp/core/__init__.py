@@ -1,7 +1,7 @@
 """Ground floor: array vocabulary, tolerances by dtype, statuses, rigid-body geometry, errors. It knows no grasp."""
 
 from .answer import Answer
-from .arrays import Array, ArrayLike, Bool, Float, Index, Int, on_host, real_array, widened
+from .arrays import Array, ArrayLike, Bool, Float, Index, Int, on_host, placed, real_array, uniform, widened
 from .broadcast import spread
 from .errors import UserError
 from .geometry import (
@@ -34,6 +34,7 @@ from .tolerances import (
     complementary_ratio,
     edge_tolerance,
     gap_floor,
+    gap_goal,
     largest_response,
     pivot_tolerance,
     proven_limit,
@@ -67,6 +68,7 @@ __all__ = [
     "first_of",
     "frame_components",
     "gap_floor",
+    "gap_goal",
     "identity_orientation",
     "jacobian_product",
     "jacobian_solve",
@@ -77,6 +79,7 @@ __all__ = [
     "orientation_matrix",
     "part_of",
     "pivot_tolerance",
+    "placed",
     "proven_limit",
     "rank_tolerance",
     "real_array",
@@ -90,6 +93,7 @@ __all__ = [
     "spread",
     "stationary_tolerance",
     "turned",
+    "uniform",
     "unit_roundoff",
     "visibility_tolerance",
     "widened",

@@ -9,10 +9,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.typing import ArrayLike
+from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
-__all__ = ["Array", "ArrayLike", "Bool", "Float", "Index", "Int", "on_host", "real_array", "widened"]
+__all__ = [
+    "Array",
+    "ArrayLike",
+    "Bool",
+    "Float",
+    "Index",
+    "Int",
+    "on_host",
+    "placed",
+    "real_array",
+    "uniform",
+    "widened",
+]
 
 # What a batch is indexed by, as NumPy does it.
 Index = int | slice | EllipsisType | ArrayLike | tuple[int | slice | EllipsisType | ArrayLike, ...]
@@ -21,7 +33,7 @@ Index = int | slice | EllipsisType | ArrayLike | tuple[int | slice | EllipsisTyp
 def real_array(value: ArrayLike, name: str, means: str = "a number or an array of numbers") -> Array:
     """``value`` as an array of a floating dtype; ValueError, with what it ``means``, where it holds no real numbers."""
     try:
-        array = jnp.asarray(value)
+        array = _array(value)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be {means}, got {value!r}") from error
     if jnp.issubdtype(array.dtype, jnp.floating):
@@ -29,6 +41,28 @@ def real_array(value: ArrayLike, name: str, means: str = "a number or an array o
     if not jnp.issubdtype(array.dtype, jnp.integer):
         raise ValueError(f"{name} must hold real numbers, got dtype {array.dtype}")
     return array.astype(jnp.result_type(float))
+
+
+def _array(value: ArrayLike) -> Array:
+    """``jnp.asarray(value)``; what NumPy can read compiles nothing."""
+    if isinstance(value, np.ndarray | list | tuple):
+        try:
+            known = np.array(value)  # a copy: JAX may keep the memory, and the caller may change it
+        except TypeError:
+            return jnp.asarray(value)  # numbers that are being traced
+        if known.dtype.kind in "fiub":
+            return placed(known)
+    return jnp.asarray(value)
+
+
+def placed(array: np.ndarray) -> Array:
+    """``array``, which nobody changes any more, as JAX's: ``jnp.asarray`` would compile a program for each shape."""
+    return jax.device_put(array)
+
+
+def uniform(shape: tuple[int, ...], value: float, dtype: DTypeLike) -> Array:
+    """``value`` everywhere in ``shape``."""
+    return placed(np.full(shape, value, dtype))
 
 
 def _here(leaf: Any) -> bool:
@@ -50,5 +84,5 @@ def widened(value: Array, shape: tuple[int, ...]) -> Array:
     if value.shape == shape:
         return value
     if on_host(value):
-        return jnp.asarray(np.broadcast_to(np.asarray(value), shape))
+        return placed(np.broadcast_to(np.asarray(value), shape))
     return jnp.broadcast_to(value, shape)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .arrays import Array, Index, on_host
+from .arrays import Array, Index, on_host, placed
 
 __all__ = ["first_of", "part_of"]
 
@@ -24,7 +24,7 @@ def part_of(batch: Batch, index: Index) -> Batch:
     if not on_host((batch, index)):
         return jax.tree.map(lambda x: x[index], batch)
     where = jax.tree.map(lambda i: np.asarray(i) if isinstance(i, jax.Array) else i, index)
-    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[where]), batch)
+    return jax.tree.map(lambda x: placed(np.asarray(np.asarray(x)[where])), batch)
 
 
 def first_of(table: Sequence[tuple[Array, int]], otherwise: Array | int) -> Array:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike, DTypeLike
+
+from .arrays import Array, placed
 
 __all__ = [
     "balance_tolerance",
     "complementary_ratio",
     "edge_tolerance",
     "gap_floor",
+    "gap_goal",
     "largest_response",
     "pivot_tolerance",
     "proven_limit",
@@ -33,6 +37,14 @@ def gap_floor(dtype) -> float:
     Tighter requests are served as far as this floor; the reported gap stays the measured one.
     """
     return 2e4 * unit_roundoff(dtype) if jnp.dtype(dtype).itemsize == 8 else 160 * unit_roundoff(dtype)
+
+
+def gap_goal(tolerance: ArrayLike, dtype: DTypeLike) -> Array:
+    """The duality gap to reach: ``tolerance``, but no less than ``gap_floor``."""
+    floor = gap_floor(dtype)
+    if isinstance(tolerance, int | float):
+        return placed(np.asarray(max(tolerance, floor), dtype))
+    return jnp.maximum(jnp.asarray(tolerance, dtype), jnp.asarray(floor, dtype))
 
 
 def rank_tolerance(dtype) -> float:

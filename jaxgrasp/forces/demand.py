@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from ..contacts import Contacts, Grasp, TorqueLimits, contacts_of
-from ..core import Array, real_array, spread, wrench_dimension
+from ..core import Array, real_array, spread, widened, wrench_dimension
 from .criteria import Criterion
 from .problem import Demand
 
@@ -25,20 +24,20 @@ def spread_loads(grasp: Grasp, wrench: Any) -> tuple[Array, tuple[int, ...]]:
         )
     lead = array.shape[:-1]
     if not lead:
-        return jnp.broadcast_to(array, (*batch, m)), batch
+        return widened(array, (*batch, m)), batch
     if len(lead) < len(batch) or any(a not in (1, b) for a, b in zip(lead, batch, strict=False)):
         raise ValueError(
             f"the leading axes of wrench {array.shape} must start with the grasp's batch axes {batch} "
             "(further axes are several loads for each grasp)"
         )
     shape = (*batch, *lead[len(batch) :])
-    return jnp.broadcast_to(array, (*shape, m)), shape
+    return widened(array, (*shape, m)), shape
 
 
 def _weight(value: Array, batch: tuple[int, ...], shape: tuple[int, ...]) -> Array:
     """One per problem: from one for all, one per grasp, or one per load."""
     if value.ndim == len(shape) > len(batch):
-        return jnp.broadcast_to(value, shape)
+        return widened(value, shape)
     return spread(value, (), batch, "the criterion's weight", shape[len(batch) :])
 
 

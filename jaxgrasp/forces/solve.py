@@ -21,7 +21,7 @@ from ..backend import Sweeps, batched, in_chunks, in_sweeps, is_traced, tile_wid
 from ..certificates import check_forces, checked_by, force_claim
 from ..conic import ConvexState, as_vector, begin_convex_cone_program, regular, solve_convex_cone_program
 from ..contacts import Component, Grasp, TorqueLimits, tile_of, to_twist
-from ..core import Answer, Array, Bool, Float, Int, Status, gap_floor, unit_roundoff, wrench_dimension
+from ..core import Answer, Array, Bool, Float, Int, Status, gap_goal, unit_roundoff, wrench_dimension
 from .answer import Answer as LaneAnswer
 from .answer import answer
 from .criteria import Criterion, Gentlest
@@ -277,8 +277,7 @@ def optimize_forces(
     joints = 0 if demand.jacobian is None else demand.jacobian.shape[-1]
     width = tile_width((wrench_dimension(grasp.dimension) + joints) * grasp.contacts * len(components))
     plan = _Plan(components, grasp.dimension, width, False)
-    floor = gap_floor(grasp.dtype)
-    goal = jnp.maximum(jnp.asarray(tolerance, grasp.dtype), jnp.asarray(floor, grasp.dtype))
+    goal = gap_goal(tolerance, grasp.dtype)
     solved = _solved(plan, rows, goal)
     a = solved.answer
     return OptimalForces(

@@ -6,20 +6,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..core import Array, Status, gap_floor, rank_tolerance, unit_roundoff
+from ..core import Array, Status, gap_goal, rank_tolerance, unit_roundoff
 from .problem import LMIProblem, LMISolution, LogDetTerm, check_shapes, over_batch
 
-__all__ = ["gap_goal", "lmi_minimize", "minimize"]
+__all__ = ["lmi_minimize", "minimize"]
 
 CENTRED = 0.25  # Newton decrement below which an iterate counts as central
 WEIGHT_GROWTH = 20.0  # t grows by this factor at every central point
 MAX_STEPS = 250
 REFINEMENTS = 2  # of a Newton direction, for its dual point's sake
-
-
-def gap_goal(tolerance: float, dtype) -> Array:
-    """The tolerance, no lower than the dtype allows."""
-    return jnp.maximum(jnp.asarray(tolerance, dtype), jnp.asarray(gap_floor(dtype), dtype))
 
 
 class _Coordinates(eqx.Module):

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from ..core import Answer, Array, Float, Int, Status, rounding_constant, unit_roundoff
-from .barrier import gap_goal, lmi_minimize, minimize
+from ..core import Answer, Array, Float, Int, Status, gap_goal, rounding_constant, unit_roundoff
+from .barrier import lmi_minimize, minimize
 from .problem import LMIProblem, bracket_words, expect_shape, over_batch
 
 __all__ = [

@@ -17,9 +17,20 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from ..contacts import Grasp, TorqueLimits, grasp_map, is_grasp, length_scale, null_space
-from ..core import Answer, Array, Float, Int, Status, rank_tolerance, real_array, spread, wrench_dimension
+from ..core import (
+    Answer,
+    Array,
+    Float,
+    Int,
+    Status,
+    gap_goal,
+    rank_tolerance,
+    real_array,
+    spread,
+    wrench_dimension,
+)
 from ..forces import Criterion
-from .barrier import gap_goal, minimize
+from .barrier import minimize
 from .feasibility import feasibility
 from .friction import friction_lmi
 from .problem import LMIProblem, LogDetTerm, bracket_words

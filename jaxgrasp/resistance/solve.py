@@ -46,7 +46,7 @@ from ..core import (
     Float,
     Int,
     Status,
-    gap_floor,
+    gap_goal,
     rank_tolerance,
     rounding_constant,
     unit_roundoff,
@@ -349,8 +349,7 @@ def wrench_resistance(
     components = grasp.model.components(grasp.dimension)
     width = tile_width(wrench_dimension(grasp.dimension) * grasp.contacts * len(components))
     plan = _Plan(components, grasp.dimension, bool(verdict_only), width, False)
-    floor = gap_floor(grasp.dtype)
-    goal = jnp.maximum(jnp.asarray(tolerance, grasp.dtype), jnp.asarray(floor, grasp.dtype))
+    goal = gap_goal(tolerance, grasp.dtype)
     contacts = contacts_of(grasp)
     traced = is_traced((contacts, goal))
     if traced or jax.default_backend() != "cpu":
