@@ -26,7 +26,8 @@ if LEVEL_FLAG not in os.environ.get("XLA_FLAGS", ""):
     level = os.environ.get("JAXGRASP_TEST_OPTIMIZATION", "0")
     if level not in ("0", "1", "2", "3"):
         raise pytest.UsageError(f"JAXGRASP_TEST_OPTIMIZATION must be 0, 1, 2 or 3, not {level!r}")
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {LEVEL_FLAG}={level}".strip()
+    quick = [f"{LEVEL_FLAG}={level}"] + ["--xla_llvm_disable_expensive_passes=true"] * (level == "0")
+    os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *quick]).strip()
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(STORE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")

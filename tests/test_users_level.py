@@ -19,7 +19,8 @@ TOLERANCE = 1e-11
 
 def at_users_level(function, *arguments):
     """What ``function`` gives, compiled as users compile it."""
-    return jax.jit(function).lower(*arguments).compile({"xla_backend_optimization_level": 3})(*arguments)
+    options = {"xla_backend_optimization_level": 3, "xla_llvm_disable_expensive_passes": False}
+    return jax.jit(function).lower(*arguments).compile(options)(*arguments)
 
 
 @pytest.fixture(scope="module")
