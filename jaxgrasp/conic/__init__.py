@@ -3,7 +3,14 @@
 It has never heard of grasping: it knows cones, a few dense equality constraints, and lanes.
 """
 
-from .cholesky import Cholesky, inverse_frobenius, null_combination, solve_lower, solve_transposed
+from .cholesky import (
+    Cholesky,
+    inverse_frobenius,
+    null_combination,
+    residual_lower,
+    solve_lower,
+    solve_transposed,
+)
 from .cone import (
     Cone,
     cone_all,
@@ -69,6 +76,7 @@ __all__ = [
     "orthonormal_rows",
     "point_tangent",
     "regular",
+    "residual_lower",
     "residuals",
     "rmatvec",
     "row_svd",

@@ -20,6 +20,7 @@ __all__ = [
     "cholesky_solve",
     "inverse_frobenius",
     "null_combination",
+    "residual_lower",
     "solve_lower",
     "solve_transposed",
 ]
@@ -109,17 +110,29 @@ def solve_transposed(factor: Cholesky, rhs: Vector) -> Vector:
     return _back_substituted(factor, rhs)
 
 
-@stage
-def solve_lower(factor: Cholesky, rhs: Vector) -> tuple[Vector, Vector]:
-    """x with ``L x = rhs`` as far as L goes, and the residual in the rows whose pivot was rounding."""
+def _forward_substituted(factor: Cholesky, rhs: Vector) -> tuple[Vector, Vector]:
+    """x with ``L x = rhs``, and what each row has to give before it is divided by its pivot."""
     columns, inverse = factor
-    x, residual = list(rhs), []
+    x, left = list(rhs), []
     for i in range(len(x)):
         for q in range(i):
             x[i] = x[i] - columns[q][i - q] * x[q]
-        residual.append(jnp.where(inverse[i] > 0, jnp.zeros_like(x[i]), x[i]))
+        left.append(x[i])
         x[i] = x[i] * inverse[i]
-    return tuple(x), tuple(residual)
+    return tuple(x), tuple(left)
+
+
+@stage
+def solve_lower(factor: Cholesky, rhs: Vector) -> Vector:
+    """x with ``L x = rhs``; 0 in the rows whose pivot was rounding."""
+    return _forward_substituted(factor, rhs)[0]
+
+
+@stage
+def residual_lower(factor: Cholesky, rhs: Vector) -> Vector:
+    """``rhs - L x`` of ``solve_lower``: what the rows whose pivot was rounding leave."""
+    _, left = _forward_substituted(factor, rhs)
+    return tuple(jnp.where(p > 0, jnp.zeros_like(r), r) for p, r in zip(factor.inverse, left, strict=True))
 
 
 @stage

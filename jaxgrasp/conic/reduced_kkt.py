@@ -149,7 +149,7 @@ def _bounded(frame: JordanFrame, limit: float) -> JordanFrame:
 def _orthonormal(triangle: Cholesky, columns: Cone) -> Cone:
     """``L^-1 B`` over E."""
     m = len(triangle.inverse)
-    solved = [solve_lower(triangle, tuple(c[i] for i in range(m)))[0] for c in columns]
+    solved = [solve_lower(triangle, tuple(c[i] for i in range(m))) for c in columns]
     return _over(solved, tuple(c[m:] for c in columns))
 
 
@@ -160,7 +160,7 @@ def _over(upper: list[Vector], lower: Cone) -> Cone:
 
 def _scaled(frame: JordanFrame, triangle: Cholesky, rhs: KKTVector) -> ScaledSides:
     """``rhs`` in scaled coordinates, its equations multiplied by L^-1."""
-    solved, _ = solve_lower(triangle, as_vector(rhs.y))
+    solved = solve_lower(triangle, as_vector(rhs.y))
     h, head, rows = _sides(frame, rhs.u, solved, rhs.beta)
     return ScaledSides(h, head, rhs.xi, rows)
 

@@ -68,7 +68,7 @@ class ScaledKKT(NamedTuple):
 
     def solve(self, rhs: ScaledSides) -> ScaledDirection:
         """By projection: the unconstrained solution, moved along the rows of Q until ``R W p = rows``."""
-        target, _ = solve_lower(self.triangle, as_vector(rhs.rows))
+        target = solve_lower(self.triangle, as_vector(rhs.rows))
         free = _unconstrained(self.blocks, self.border, rhs)
         components = _components(self.basis, free, target)
         multipliers = solve_transposed(self.triangle, components)

@@ -23,6 +23,7 @@ from ..conic import (
     Vector,
     as_vector,
     null_combination,
+    residual_lower,
     solve_lower,
     vector_norm,
 )
@@ -121,7 +122,7 @@ def load_of(tile: Tile, demand: Demand) -> tuple[Load, Array]:
     wrench = to_lanes(demand.wrench)
     rows, finite = _scaled_wrench(wrench[: tile.dimension], wrench[tile.dimension :], folded.length)
     outer = as_vector(rows)
-    inner, residual = solve_lower(factor, outer)
+    inner, residual = solve_lower(factor, outer), residual_lower(factor, outer)
     rhs, size, off, rest = _load_size(inner, residual, outer, folded.norm, demand.criterion.barrier_weight)
     return Load(outer, rhs, size, off, null_combination(factor, residual), rest), finite
 
