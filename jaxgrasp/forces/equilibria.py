@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from ..contacts import Grasp, TorqueLimits, folded_grasp_map, length_scale
-from ..core import Answer, Array, Bool, Float, Int, Status, rank_tolerance
+from ..core import Answer, Array, Bool, Float, Int, Status, first_of, rank_tolerance
 from ..resistance import wrench_resistance
 from .criteria import Criterion, Gentlest, Robust, SmallestSum
 from .demand import spread_loads
@@ -49,6 +50,7 @@ class Equilibrium(Answer):
     }
 
 
+@eqx.filter_jit
 def _slack(grasp: Grasp, force: Array) -> Array:
     n, loads = grasp.model.force_size(grasp.dimension), force.ndim - 1 - len(grasp.batch_shape)
     wide = _with_load_axes(grasp, loads)
@@ -84,21 +86,26 @@ def equilibrium(
     edge = robust
     if isinstance(decided, Tracer) or not bool(jnp.all(decided)):
         edge = optimize_forces(grasp, wrench, criterion=SmallestSum(), tolerance=tolerance)
-    status = jnp.full(robust.status.shape, Status.UNDECIDED.value, jnp.int32)
+    return _equilibrium(grasp, robust, edge)
 
-    def choose(value: Status, where: Array, otherwise: Array) -> Array:
-        return jnp.where(where, jnp.int32(value.value), otherwise)
 
-    status = choose(Status.MARGINAL, edge.status == Status.OPTIMAL.value, status)
-    none = (robust.status == Status.INFEASIBLE.value) | (edge.status == Status.INFEASIBLE.value)
-    status = choose(Status.NO_EQUILIBRIUM, none, status)
-    status = choose(Status.NON_MARGINAL, inside, status)
-    status = choose(Status.INVALID, robust.status == Status.INVALID.value, status)
+@eqx.filter_jit
+def _equilibrium(grasp: Grasp, robust: OptimalForces, edge: OptimalForces) -> Equilibrium:
+    """What the robust optimum says, and the least forces where it says nothing."""
+    inside = (robust.status == Status.OPTIMAL.value) & (_slack(grasp, robust.force) > 0)
+    refuted = robust.status == Status.INFEASIBLE.value
+    status = first_of(
+        [
+            (robust.status == Status.INVALID.value, Status.INVALID),
+            (inside, Status.NON_MARGINAL),
+            (refuted | (edge.status == Status.INFEASIBLE.value), Status.NO_EQUILIBRIUM),
+            (edge.status == Status.OPTIMAL.value, Status.MARGINAL),
+        ],
+        Status.UNDECIDED,
+    )
     force = jnp.where(inside[..., None], robust.force, edge.force)
     slack = jnp.where(status == Status.NO_EQUILIBRIUM.value, -jnp.inf, _slack(grasp, force))
-    escape = jnp.where(
-        (robust.status == Status.INFEASIBLE.value)[..., None], robust.escape_twist, edge.escape_twist
-    )
+    escape = jnp.where(refuted[..., None], robust.escape_twist, edge.escape_twist)
     return Equilibrium(status, force, slack, escape)
 
 

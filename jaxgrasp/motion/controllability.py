@@ -24,7 +24,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from ..contacts import Grasp
-from ..core import Answer, Array, Float, Int, Status, rank_tolerance, wrench_dimension
+from ..core import Answer, Array, Float, Int, Status, first_of, rank_tolerance, wrench_dimension
 from ..resistance import wrench_resistance
 from .linearization import Linearization, Scaled, first_order, is_equilibrium, linearize, scaled_system
 from .rigid_body import RigidBody
@@ -188,24 +188,23 @@ def _proved(linear: Linearization, resistance: Array, body: RigidBody, system: S
     )
 
 
-def _verdict(point: Array, status: Array, full: Array) -> Array:
-    verdict = jnp.full(point.shape, Status.UNDECIDED.value, jnp.int32)
-
-    def choose(where: Array, value: Status) -> None:
-        nonlocal verdict
-        verdict = jnp.where(where, jnp.int32(value.value), verdict)
-
-    choose((point == Status.MARGINAL.value) & full, Status.MARGINAL)
-    choose((point == Status.NON_MARGINAL.value) & full, Status.CONTROLLABLE)
+def _verdict(point: Array, resistance: Array, full: Array) -> Array:
+    """What equilibrium, wrench resistance and full rank prove together."""
     known = is_equilibrium(point)
-    choose(known & ~full, Status.NOT_CONTROLLABLE)
-    # an internal force moves any equilibrium of a resistant grasp inside the cones
-    choose(known & full & (status == Status.RESISTANT.value), Status.RESISTANT)
     absent = (point == Status.NO_EQUILIBRIUM.value) | (point == Status.NOT_BALANCED.value)
-    choose(absent, Status.NO_EQUILIBRIUM)
-    invalid = (point == Status.INVALID.value) | (status == Status.INVALID.value)
-    choose(invalid, Status.INVALID)
-    return verdict
+    invalid = (point == Status.INVALID.value) | (resistance == Status.INVALID.value)
+    return first_of(
+        [
+            (invalid, Status.INVALID),
+            (absent, Status.NO_EQUILIBRIUM),
+            # an internal force moves any equilibrium of a resistant grasp inside the cones
+            (known & full & (resistance == Status.RESISTANT.value), Status.RESISTANT),
+            (known & ~full, Status.NOT_CONTROLLABLE),
+            (full & (point == Status.NON_MARGINAL.value), Status.CONTROLLABLE),
+            (full & (point == Status.MARGINAL.value), Status.MARGINAL),
+        ],
+        Status.UNDECIDED,
+    )
 
 
 def _units(system: Scaled, dimension: int) -> Array:
