@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 REFERENCE = ROOT / "benchmarks" / "data" / "gpu_reference.npz"
-ITEMS = ["margin-k4-float64-256", "gentlest-gradient-k4-float64-256"]
+ITEMS = ["margin-k4-float64-256", "margin-gradient-k4-float64-256"]
 
 
 def check(tmp_path, *arguments):

@@ -96,8 +96,8 @@ def test_derivatives_of_the_floor_are_those_of_differences(grasps):
 
 def test_the_bank_gives_a_mean_of_slopes_but_its_smallest_value(grasps):
     held = np.flatnonzero(np.asarray(jg.wrench_resistance(grasps).margin) > 0.05)
-    grasp = grasps[held]
-    _, memory = smallest_of_bank(grasp, "L1", 2)
+    _, memory = smallest_of_bank(grasps, "L1", 2)
+    grasp, memory = grasps[held], jax.tree.map(lambda x: x[held], memory)
     climbed = Epsilon("L1", SCALE)
     h = np.asarray(
         signed_supports(effort_map(grasp, torque_lengths(grasp, SCALE)), grasp.active, "L1", memory.direction)

@@ -76,8 +76,8 @@ def random_rotation(rng: np.random.Generator, dimension: int = 3) -> np.ndarray:
     return q
 
 
-def ball(rng, count, k, tilt=0.3):
-    """Hard fingers on a unit sphere with tilted normals: position, normal, friction."""
-    position = rng.normal(size=(count, k, 3))
+def ball(rng, count, k, tilt=0.3, dimension=3):
+    """Hard fingers on a unit sphere or circle with tilted normals: position, normal, friction."""
+    position = rng.normal(size=(count, k, dimension))
     position /= np.linalg.norm(position, axis=-1, keepdims=True)
     return position, -position + tilt * rng.normal(size=position.shape), rng.uniform(0.3, 0.8, (count, k))
