@@ -27,7 +27,7 @@ from .rotations import (
     rotation_between,
     turned,
 )
-from .select import first_of, part_of
+from .select import bracket_width, first_of, part_of
 from .status import Status
 from .tolerances import (
     balance_tolerance,
@@ -60,6 +60,7 @@ __all__ = [
     "__version__",
     "applied",
     "balance_tolerance",
+    "bracket_width",
     "complementary_ratio",
     "contact_frame",
     "cross",

@@ -11,7 +11,7 @@ import numpy as np
 
 from .arrays import Array, Index, on_host, placed
 
-__all__ = ["first_of", "part_of"]
+__all__ = ["bracket_width", "first_of", "part_of"]
 
 Batch = TypeVar("Batch")  # a pytree of arrays with the batch axes in front
 
@@ -38,3 +38,10 @@ def first_of(table: Sequence[tuple[Array, int]], otherwise: Array | int) -> Arra
     for condition, code in reversed(table):
         otherwise = jnp.where(condition, jnp.int32(int(code)), otherwise)
     return otherwise
+
+
+@jax.jit
+def bracket_width(lower: Array, upper: Array) -> Array:
+    """``upper - lower`` of a bracket; 0 where both are the same infinity."""
+    same = lower == upper
+    return jnp.where(same, jnp.zeros_like(lower), upper - lower)

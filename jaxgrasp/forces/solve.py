@@ -21,7 +21,18 @@ from ..backend import Sweeps, batched, in_chunks, in_sweeps, is_traced, tile_wid
 from ..certificates import check_forces, checked_by, force_claim
 from ..conic import ConvexState, as_vector, begin_convex_cone_program, regular, solve_convex_cone_program
 from ..contacts import Component, Grasp, TorqueLimits, tile_of, to_twist
-from ..core import Answer, Array, Bool, Float, Int, Status, gap_goal, unit_roundoff, wrench_dimension
+from ..core import (
+    Answer,
+    Array,
+    Bool,
+    Float,
+    Int,
+    Status,
+    bracket_width,
+    gap_goal,
+    unit_roundoff,
+    wrench_dimension,
+)
 from .answer import Answer as LaneAnswer
 from .answer import answer
 from .criteria import Criterion, Gentlest
@@ -90,8 +101,7 @@ class OptimalForces(Answer):
     @property
     def gap(self) -> Float[Array, "*batch"]:
         """``upper - lower``: no admissible force is cheaper by more; 0 where INFEASIBLE."""
-        same = self.upper == self.lower  # both may be infinite
-        return jnp.where(same, jnp.zeros_like(self.upper), self.upper - self.lower)
+        return bracket_width(self.lower, self.upper)
 
     def values(self, index: int | tuple[int, ...] = ()) -> str:
         """The bracket of one lane's cost in words."""

@@ -44,6 +44,12 @@ def second_order_cone_lmi(
     rows, columns = A.shape[-2:]
     expect_shape(b.shape[-1:] == (rows,), "b", f"(*batch, {rows})", b)
     expect_shape(c.shape[-1:] == (columns,), "c", f"(*batch, {columns})", c)
+    return _arrow(A, b, c, d)
+
+
+@jax.jit
+def _arrow(A: Array, b: Array, c: Array, d: Array) -> tuple[Array, Array]:
+    rows = A.shape[-2]
     stacked = jnp.concatenate(
         [b[..., None], A], axis=-1
     )  # column 0: the constant part; column i: that of x_i

@@ -45,6 +45,7 @@ def _distances(position: Array) -> Array:
     return jnp.stack([safe_root(jnp.sum(d * d, axis=-1)) for d in apart], axis=-1)
 
 
+@eqx.filter_jit
 def total_excess(
     requirements: Sequence[Requirement],
     surface: SmoothSurface,

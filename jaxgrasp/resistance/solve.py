@@ -46,6 +46,7 @@ from ..core import (
     Float,
     Int,
     Status,
+    bracket_width,
     gap_goal,
     rank_tolerance,
     rounding_constant,
@@ -104,8 +105,7 @@ class WrenchResistance(Answer):
     @property
     def gap(self) -> Float[Array, "*batch"]:
         """``upper - lower``: how far t* may be above ``margin``; 0 where both are infinite."""
-        same = self.lower == self.upper
-        return jnp.where(same, jnp.zeros_like(self.lower), self.upper - self.lower)
+        return bracket_width(self.lower, self.upper)
 
     def values(self, index: int | tuple[int, ...] = ()) -> str:
         """Margin and rank of one lane in words."""
