@@ -8,11 +8,10 @@ in space and 3 in the plane; a twist is (velocity in m/s; angular velocity in ra
 from __future__ import annotations
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..core import Array, ArrayLike, Bool, Float, Index, on_host, part_of, placed, real_array, widened
+from ..core import Array, ArrayLike, Bool, Float, Index, as_array, part_of, placed, real_array, widened
 from .models import ContactModel
 
 __all__ = ["Grasp"]
@@ -88,8 +87,7 @@ class Grasp(eqx.Module):
         if active is None:
             self.active = placed(np.ones(contacts, bool))
         else:
-            known = not isinstance(active, jax.Array) and on_host(active)
-            mask = placed(np.array(active)) if known else jnp.asarray(active)
+            mask = as_array(active)
             if mask.dtype != jnp.bool_:
                 raise ValueError(f"active must be boolean, one per contact, got dtype {mask.dtype}")
             self.active = _per_contact(mask, contacts, "active")

@@ -1,7 +1,7 @@
 """Ground floor: array vocabulary, tolerances by dtype, statuses, rigid-body geometry, errors. It knows no grasp."""
 
 from .answer import Answer
-from .arrays import Array, ArrayLike, Bool, Float, Index, Int, on_host, placed, real_array, uniform, widened
+from .arrays import Array, ArrayLike, Bool, Float, Index, Int, as_array, placed, real_array, uniform, widened
 from .broadcast import spread
 from .errors import UserError
 from .geometry import (
@@ -59,6 +59,7 @@ __all__ = [
     "UserError",
     "__version__",
     "applied",
+    "as_array",
     "balance_tolerance",
     "bracket_width",
     "complementary_ratio",
@@ -76,7 +77,6 @@ __all__ = [
     "largest_response",
     "normalize",
     "normalize_components",
-    "on_host",
     "orientation_matrix",
     "part_of",
     "pivot_tolerance",

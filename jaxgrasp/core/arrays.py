@@ -19,6 +19,7 @@ __all__ = [
     "Float",
     "Index",
     "Int",
+    "as_array",
     "on_host",
     "placed",
     "real_array",
@@ -33,7 +34,7 @@ Index = int | slice | EllipsisType | ArrayLike | tuple[int | slice | EllipsisTyp
 def real_array(value: ArrayLike, name: str, means: str = "a number or an array of numbers") -> Array:
     """``value`` as an array of a floating dtype; ValueError, with what it ``means``, where it holds no real numbers."""
     try:
-        array = _array(value)
+        array = as_array(value)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be {means}, got {value!r}") from error
     if jnp.issubdtype(array.dtype, jnp.floating):
@@ -43,7 +44,7 @@ def real_array(value: ArrayLike, name: str, means: str = "a number or an array o
     return array.astype(jnp.result_type(float))
 
 
-def _array(value: ArrayLike) -> Array:
+def as_array(value: ArrayLike) -> Array:
     """``jnp.asarray(value)``; what NumPy can read compiles nothing."""
     if isinstance(value, np.ndarray | list | tuple):
         try:

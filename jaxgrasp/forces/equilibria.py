@@ -86,13 +86,12 @@ def equilibrium(
     edge = robust
     if isinstance(decided, Tracer) or not bool(jnp.all(decided)):
         edge = optimize_forces(grasp, wrench, criterion=SmallestSum(), tolerance=tolerance)
-    return _equilibrium(grasp, robust, edge)
+    return _equilibrium(grasp, inside, robust, edge)
 
 
 @eqx.filter_jit
-def _equilibrium(grasp: Grasp, robust: OptimalForces, edge: OptimalForces) -> Equilibrium:
-    """What the robust optimum says, and the least forces where it says nothing."""
-    inside = (robust.status == Status.OPTIMAL.value) & (_slack(grasp, robust.force) > 0)
+def _equilibrium(grasp: Grasp, inside: Array, robust: OptimalForces, edge: OptimalForces) -> Equilibrium:
+    """What the robust optimum says, and the least forces where it says nothing; ``inside``: its forces are."""
     refuted = robust.status == Status.INFEASIBLE.value
     status = first_of(
         [

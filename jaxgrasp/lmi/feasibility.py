@@ -11,7 +11,17 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from ..core import Answer, Array, Float, Int, Status, gap_goal, rounding_constant, unit_roundoff
+from ..core import (
+    Answer,
+    Array,
+    Float,
+    Int,
+    Status,
+    bracket_width,
+    gap_goal,
+    rounding_constant,
+    unit_roundoff,
+)
 from .barrier import lmi_minimize, minimize
 from .problem import LMIProblem, bracket_words, expect_shape, over_batch
 
@@ -207,8 +217,7 @@ class SDPSolution(Answer):
     @property
     def gap(self) -> Float[Array, "*batch"]:
         """``upper - lower >= 0``: no feasible x is cheaper by more; 0 where INFEASIBLE."""
-        same = self.upper == self.lower  # both may be infinite
-        return jnp.where(same, jnp.zeros_like(self.upper), self.upper - self.lower)
+        return bracket_width(self.lower, self.upper)
 
     def values(self, index: int | tuple[int, ...] = ()) -> str:
         """The bracket of one lane's cost in words."""
