@@ -35,7 +35,7 @@ from .linear_interior_point import (
     solve_linear_cone_program,
 )
 from .linear_newton_step import LinearPoint, LinearStep
-from .products import Vector, as_vector, matvec, rmatvec, vector_norm
+from .products import matvec, rmatvec, vector_inner, vector_norm
 from .reduced_kkt import KKTVector, kkt_solve
 from .regularity import regular
 from .singular_values import row_svd
@@ -54,9 +54,7 @@ __all__ = [
     "LinearState",
     "LinearStep",
     "PointShift",
-    "Vector",
     "advance_linear_cone_program",
-    "as_vector",
     "begin_convex_cone_program",
     "begin_linear_cone_program",
     "centring",
@@ -85,5 +83,6 @@ __all__ = [
     "solve_lower",
     "solve_transposed",
     "tail_norm",
+    "vector_inner",
     "vector_norm",
 ]

@@ -12,7 +12,6 @@ from jax import lax
 
 from ..backend import stage
 from ..core import Array
-from .products import Vector
 
 __all__ = [
     "Cholesky",
@@ -50,7 +49,7 @@ def _inverse_pivot(pivot: Array, threshold: Array) -> Array:
 
 
 @stage
-def _floor(diagonal: Vector, factor: Array) -> Array:
+def _floor(diagonal: list[Array], factor: Array) -> Array:
     largest = diagonal[0]
     for d in diagonal[1:]:
         largest = jnp.maximum(largest, d)
@@ -69,7 +68,7 @@ def cholesky(M: tuple[Array, ...], tolerance: float) -> Cholesky:
     ``(2 tolerance)^2`` times the largest one (a row of B that is rounding as a whole).
     """
     dtype = M[0].dtype
-    floor = _floor(tuple(column[0] for column in M), jnp.asarray(4 * tolerance * tolerance, dtype))
+    floor = _floor([column[0] for column in M], jnp.asarray(4 * tolerance * tolerance, dtype))
     columns: list[Array] = []
     inverse: list[Array] = []
     for j, lower in enumerate(M):
@@ -82,35 +81,29 @@ def cholesky(M: tuple[Array, ...], tolerance: float) -> Cholesky:
     return Cholesky(tuple(columns), tuple(inverse))
 
 
-def _back_substituted(factor: Cholesky, rhs: Vector) -> Vector:
+def _back_substituted(factor: Cholesky, x: list[Array]) -> Array:
     columns, inverse = factor
-    x = list(rhs)
     for i in reversed(range(len(x))):
         for q in range(i + 1, len(x)):
             x[i] = x[i] - columns[i][q - i] * x[q]
         x[i] = x[i] * inverse[i]
-    return tuple(x)
+    return jnp.stack(x)
 
 
 @stage
-def cholesky_solve(factor: Cholesky, rhs: Vector) -> Vector:
-    """``M^-1 rhs`` by forward and back substitution."""
-    columns, inverse = factor
-    x = list(rhs)
-    for i in range(len(x)):
-        for q in range(i):
-            x[i] = x[i] - columns[q][i - q] * x[q]
-        x[i] = x[i] * inverse[i]
-    return _back_substituted(factor, tuple(x))
+def cholesky_solve(factor: Cholesky, rhs: Array) -> Array:
+    """``M^-1 rhs`` (m, L) by forward and back substitution."""
+    x, _ = _forward_substituted(factor, rhs)
+    return _back_substituted(factor, x)
 
 
 @stage
-def solve_transposed(factor: Cholesky, rhs: Vector) -> Vector:
-    """``L^-T rhs``; zero where the pivot was rounding."""
-    return _back_substituted(factor, rhs)
+def solve_transposed(factor: Cholesky, rhs: Array) -> Array:
+    """``L^-T rhs`` (m, L); zero where the pivot was rounding."""
+    return _back_substituted(factor, list(rhs))
 
 
-def _forward_substituted(factor: Cholesky, rhs: Vector) -> tuple[Vector, Vector]:
+def _forward_substituted(factor: Cholesky, rhs: Array) -> tuple[list[Array], list[Array]]:
     """x with ``L x = rhs``, and what each row has to give before it is divided by its pivot."""
     columns, inverse = factor
     x, left = list(rhs), []
@@ -119,24 +112,26 @@ def _forward_substituted(factor: Cholesky, rhs: Vector) -> tuple[Vector, Vector]
             x[i] = x[i] - columns[q][i - q] * x[q]
         left.append(x[i])
         x[i] = x[i] * inverse[i]
-    return tuple(x), tuple(left)
+    return x, left
 
 
 @stage
-def solve_lower(factor: Cholesky, rhs: Vector) -> Vector:
-    """x with ``L x = rhs``; 0 in the rows whose pivot was rounding."""
-    return _forward_substituted(factor, rhs)[0]
+def solve_lower(factor: Cholesky, rhs: Array) -> Array:
+    """x with ``L x = rhs`` (m, .., L); 0 in the rows whose pivot was rounding."""
+    return jnp.stack(_forward_substituted(factor, rhs)[0])
 
 
 @stage
-def residual_lower(factor: Cholesky, rhs: Vector) -> Vector:
+def residual_lower(factor: Cholesky, rhs: Array) -> Array:
     """``rhs - L x`` of ``solve_lower``: what the rows whose pivot was rounding leave."""
     _, left = _forward_substituted(factor, rhs)
-    return tuple(jnp.where(p > 0, jnp.zeros_like(r), r) for p, r in zip(factor.inverse, left, strict=True))
+    return jnp.stack(
+        [jnp.where(p > 0, jnp.zeros_like(r), r) for p, r in zip(factor.inverse, left, strict=True)]
+    )
 
 
 @stage
-def null_combination(factor: Cholesky, dependent: Vector) -> Vector:
+def null_combination(factor: Cholesky, dependent: Array) -> Array:
     """v with ``v^T A = 0`` for A = L Q and ``v_i = dependent_i`` in the rows that depend on those above them."""
     columns, inverse = factor
     v = list(dependent)
@@ -145,7 +140,7 @@ def null_combination(factor: Cholesky, dependent: Vector) -> Vector:
         for q in range(i + 1, len(v)):
             total = total - columns[i][q - i] * v[q]
         v[i] = jnp.where(inverse[i] > 0, total * inverse[i], v[i])
-    return tuple(v)
+    return jnp.stack(v)
 
 
 @stage

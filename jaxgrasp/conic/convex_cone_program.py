@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from ..core import Array
 from .cone import Cone, cone_sum, inner
-from .products import as_vector, matvec, rmatvec
+from .products import matvec, rmatvec
 
 # An array, or None where a program has no such part. A checker of types would ask for the same case distinction in
 # every formula, so it is told nothing.
@@ -180,7 +180,7 @@ class ConvexConeProgram(NamedTuple):
 
     def gradient(self, u: Cone, rows: Array, head: Array | float) -> Cone:
         """``D u + B^T y + E^T beta + head e_0`` with ``rows`` = (y; beta)."""
-        total = rmatvec(self.columns, as_vector(rows))
+        total = rmatvec(self.columns, rows)
         total = (total[0] + head, *total[1:])
         if self.curvature is not None:
             total = tuple(a + b for a, b in zip(total, self.curvature.apply(u), strict=True))

@@ -19,6 +19,7 @@ from ..core import Array, Status, first_of
 from .cone import cone_max, cone_min, cone_sum, inner, interior_distance
 from .convex_cone_program import ConvexConeProgram, ConvexPoint
 from .convex_newton_step import convex_newton_step, duality_excess
+from .products import vector_norm
 from .stopping import StallRule, first_code, iterate_until_stopped
 
 __all__ = ["ConvexState", "begin_convex_cone_program", "solve_convex_cone_program"]
@@ -89,11 +90,7 @@ class Multipliers(NamedTuple):
 @stage
 def _infeasibility(program: ConvexConeProgram, point: ConvexPoint) -> Array:
     applied, product = program.products(point.u)
-    residual = program.rhs - applied
-    square = jnp.zeros_like(residual[0])
-    for i in range(residual.shape[0]):
-        square = square + residual[i] * residual[i]
-    total = jnp.sqrt(square)
+    total = vector_norm(program.rhs - applied)
     for missing in program.bound_residuals(point.u, product, point.slack):
         if missing is not None:
             total = total + cone_sum(jnp.abs(missing))

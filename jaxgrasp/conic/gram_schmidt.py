@@ -13,7 +13,6 @@ from ..backend import stage
 from ..core import Array
 from .cholesky import Cholesky
 from .cone import Cone, cone_sum
-from .products import Vector
 
 __all__ = ["orthonormal_rows"]
 
@@ -41,12 +40,11 @@ def _reorthogonalized(rows: list[Array], rest: Array, overlaps: Array) -> Array:
 
 @stage
 def _row_norm(remainder: Array, floor: Array) -> tuple[Array, Array]:
-    """The norm and its reciprocal; both 0 where the norm is not above ``floor``."""
+    """The norm, and its reciprocal, which is 0 where the norm is not above ``floor``."""
     norm = jnp.sqrt(cone_sum(remainder * remainder))
     independent = norm > floor
-    zero, one = jnp.zeros_like(norm), jnp.ones_like(norm)
-    reciprocal = 1 / jnp.where(independent, norm, one)
-    return jnp.where(independent, norm, zero), jnp.where(independent, reciprocal, zero)
+    reciprocal = 1 / jnp.where(independent, norm, jnp.ones_like(norm))
+    return norm, jnp.where(independent, reciprocal, jnp.zeros_like(norm))
 
 
 @stage
@@ -70,11 +68,13 @@ def _projected_out(rest: Array, row: Array, products: Array) -> Array:
 
 
 @stage
-def _column(norm: Array, products: Array) -> Array:
-    return jnp.concatenate([norm[None], products])
+def _column(norm: Array, reciprocal: Array, products: Array | None) -> Array:
+    """A column of L, from its diagonal entry down: 0 where the row depends on those above it."""
+    pivot = jnp.where(reciprocal > 0, norm, jnp.zeros_like(norm))[None]
+    return pivot if products is None else jnp.concatenate([pivot, products])
 
 
-def orthonormal_rows(columns: Cone, floor: Array | Vector) -> tuple[Cone, Cholesky]:
+def orthonormal_rows(columns: Cone, floor: Array | list[Array]) -> tuple[Cone, Cholesky]:
     """``A = L Q`` with orthonormal rows of Q, by modified Gram-Schmidt, for A given as d arrays (m, k, L).
 
     A row whose remainder is not longer than ``floor`` (one for all, or one a row) depends on those above it and becomes
@@ -82,7 +82,7 @@ def orthonormal_rows(columns: Cone, floor: Array | Vector) -> tuple[Cone, Choles
     rounding. The components stand side by side in one array: compiling costs a fusion an array.
     """
     m = columns[0].shape[0]
-    floors = floor if isinstance(floor, tuple) else (floor,) * m
+    floors = floor if isinstance(floor, list) else [floor] * m
     rest = _stacked(columns)
     rows: list[Array] = []
     lower: list[Array] = []
@@ -90,13 +90,11 @@ def orthonormal_rows(columns: Cone, floor: Array | Vector) -> tuple[Cone, Choles
     for i in range(m):
         remainder = _reorthogonalized(rows, rest, _overlaps(rows, rest)) if rows else rest[0]
         norm, reciprocal = _row_norm(remainder, floors[i])
-        row = _row(remainder, reciprocal)
+        row, products = _row(remainder, reciprocal), None
         if i < m - 1:
             products = _products_below(rest, row)
             rest = _projected_out(rest, row, products)
-            lower.append(_column(norm, products))
-        else:
-            lower.append(norm[None])
+        lower.append(_column(norm, reciprocal, products))
         rows.append(row)
         inverse.append(reciprocal)
     return _apart(rows, [c.shape[1] for c in columns]), Cholesky(tuple(lower), tuple(inverse))

@@ -21,14 +21,14 @@ class LinearConeProgram(NamedTuple):
     """One tile of cone programs, lanes on the last axis.
 
     columns  d arrays (m, k, L): B, split by cone component
-    rhs      m arrays (L,): b
+    rhs      (m, L): b
     cost     d arrays (k, L): c
     exists   (k, L) of zeros and ones: cones that are padding take no part
     constant c_0, a number
     """
 
     columns: Cone
-    rhs: tuple[Array, ...]
+    rhs: Array
     cost: Cone
     exists: Array
     constant: float = 0.0
@@ -37,22 +37,21 @@ class LinearConeProgram(NamedTuple):
         """``c_0 + <c, u>``."""
         return self.constant + cone_sum(inner(self.cost, u))
 
-    def dual_value(self, y: tuple[Array, ...]) -> Array:
+    def dual_value(self, y: Array) -> Array:
         """``c_0 + <b, y>``."""
         total = self.constant + self.rhs[0] * y[0]
-        for b, v in zip(self.rhs[1:], y[1:], strict=True):
-            total = total + b * v
+        for i in range(1, y.shape[0]):
+            total = total + self.rhs[i] * y[i]
         return total
 
-    def slack(self, y: tuple[Array, ...]) -> Cone:
+    def slack(self, y: Array) -> Cone:
         """``z = c - B^T y``."""
         return tuple(c - v for c, v in zip(self.cost, rmatvec(self.columns, y), strict=True))
 
-    def residual(self, u: Cone) -> tuple[Array, ...]:
+    def residual(self, u: Cone) -> Array:
         """``b - B u``."""
-        applied = matvec(self.columns, u)
-        return tuple(b - applied[i] for i, b in enumerate(self.rhs))
+        return self.rhs - matvec(self.columns, u)
 
-    def optimality(self, y: tuple[Array, ...], u: Cone) -> tuple[tuple[Array, ...], Cone]:
+    def optimality(self, y: Array, u: Cone) -> tuple[Array, Cone]:
         """``(b - B u, u o z)``: zero exactly at a primal-dual solution with u and z in K."""
         return self.residual(u), jordan_product(u, self.slack(y))

@@ -21,15 +21,15 @@ from .cone import Cone, cone_max, cone_sum, inner, jordan_product, tail_inner
 from .linear_cone_program import LinearConeProgram
 from .mehrotra import boundary_fraction, clipped_ratio, step_length
 from .nesterov_todd import Scaling, interior_rate, nesterov_todd
-from .products import Vector, gram, matvec, rmatvec, vector_norm
+from .products import gram, matvec, rmatvec, vector_norm
 
 __all__ = ["LinearPoint", "LinearStep", "linear_newton_step"]
 
 
 class LinearPoint(NamedTuple):
-    """A strictly interior point: y free (m arrays (L,)), u and z in the cones (d arrays (k, L))."""
+    """A strictly interior point: y free (m, L), u and z in the cones (d arrays (k, L))."""
 
-    y: Vector
+    y: Array
     u: Cone
     z: Cone
 
@@ -48,12 +48,12 @@ def _scale(scaling: Scaling, x: Cone) -> Cone:
 
 
 @stage
-def _residual(program: LinearConeProgram, u: Cone) -> Vector:
+def _residual(program: LinearConeProgram, u: Cone) -> Array:
     return program.residual(u)
 
 
 @stage
-def _dual_direction(columns: Cone, dy: Vector) -> Cone:
+def _dual_direction(columns: Cone, dy: Array) -> Cone:
     return tuple(-x for x in rmatvec(columns, dy))
 
 
@@ -98,9 +98,8 @@ def _centring_direction(exists: Array, lam: Cone, q: Cone, head: Array, inverse:
 
 
 @stage
-def _corrector_rhs(residual: Vector, columns: Cone, h: Cone) -> Vector:
-    applied = matvec(columns, h)
-    return tuple(r - applied[i] for i, r in enumerate(residual))
+def _corrector_rhs(residual: Array, columns: Cone, h: Cone) -> Array:
+    return residual - matvec(columns, h)
 
 
 @stage
@@ -117,13 +116,12 @@ def _step_length(scaling: Scaling, lam: Cone, p: Cone, q: Cone, ratio: Array) ->
 
 @stage
 def _moved(
-    point: LinearPoint, columns: Cone, scaling: Scaling, dy: Vector, p: Cone, length: Array
+    point: LinearPoint, columns: Cone, scaling: Scaling, dy: Array, p: Cone, length: Array
 ) -> LinearPoint:
     du, dz = scaling.apply(p), rmatvec(columns, dy)
-    y = tuple(a + length * b for a, b in zip(point.y, dy, strict=True))
     u = tuple(a + length * b for a, b in zip(point.u, du, strict=True))
     z = tuple(a - length * b for a, b in zip(point.z, dz, strict=True))
-    return LinearPoint(y, u, z)
+    return LinearPoint(point.y + length * dy, u, z)
 
 
 def linear_newton_step(program: LinearConeProgram, point: LinearPoint) -> tuple[LinearPoint, LinearStep]:

@@ -1,6 +1,7 @@
 """Products of many small matrices, given by their columns, lanes on the last axis.
 
-A matrix B of m rows is d arrays (m, k, L), one for each component of the cones its columns belong to.
+A vector is one array (m, L): an array an entry would cost the compiler a loop an entry. A matrix B of m rows is d
+arrays (m, k, L), one for each component of the cones its columns belong to.
 """
 
 from __future__ import annotations
@@ -11,21 +12,20 @@ from ..backend import stage
 from ..core import Array
 from .cone import Cone
 
-__all__ = ["Vector", "as_vector", "gram", "matvec", "rmatvec", "vector_norm"]
-
-Vector = tuple[Array, ...]  # m entries of shape (L,)
+__all__ = ["gram", "matvec", "rmatvec", "vector_inner", "vector_norm"]
 
 
-def as_vector(rows: Array) -> Vector:
-    return tuple(rows[i] for i in range(rows.shape[0]))
-
-
-def vector_norm(v: Vector) -> Array:
+def vector_norm(v: Array) -> Array:
     """``|v|`` (L,)."""
-    total = v[0] * v[0]
-    for x in v[1:]:
-        total = total + x * x
-    return jnp.sqrt(total)
+    return jnp.sqrt(vector_inner(v, v))
+
+
+def vector_inner(v: Array, w: Array) -> Array:
+    """``<v, w>`` (L,)."""
+    total = v[0] * w[0]
+    for i in range(1, v.shape[0]):
+        total = total + v[i] * w[i]
+    return total
 
 
 def matvec(columns: Cone, x: Cone) -> Array:
@@ -39,12 +39,12 @@ def matvec(columns: Cone, x: Cone) -> Array:
     return total
 
 
-def rmatvec(columns: Cone, y: Vector) -> Cone:
+def rmatvec(columns: Cone, y: Array) -> Cone:
     """``B^T y``, d arrays (k, L)."""
     parts = []
     for c in columns:
         total = c[0] * y[0]
-        for i in range(1, len(y)):
+        for i in range(1, y.shape[0]):
             total = total + c[i] * y[i]
         parts.append(total)
     return tuple(parts)

@@ -23,7 +23,7 @@ from .cholesky import Cholesky, solve_lower, solve_transposed
 from .cone import Cone, cone_sum, inner
 from .convex_cone_program import Bounds, ConvexConeProgram, ConvexPoint, OptionalArray
 from .jordan_frame import JordanFrame, tail_basis, tail_size, unit_direction
-from .products import Vector, as_vector, matvec, rmatvec
+from .products import matvec, rmatvec
 from .scaled_kkt import ScaledDirection, ScaledSides, factor_scaled_kkt
 
 __all__ = ["KKTVector", "ReducedKKT", "central_products", "kkt_product", "kkt_solve", "reduced_kkt"]
@@ -87,7 +87,7 @@ def kkt_product(kkt: ReducedKKT, x: KKTVector) -> KKTVector:
     program, rates, frame = kkt.program, kkt.rates, kkt.frame
     m = program.rhs.shape[0]
     rows = x.y if x.beta is None else jnp.concatenate([x.y, x.beta])
-    adjoint = rmatvec(program.columns, as_vector(rows))
+    adjoint = rmatvec(program.columns, rows)
     along = frame.to_frame(x.u)
     stiff = frame.from_frame(tuple(h * a for h, a in zip(kkt.stiffness, along, strict=True)))
     cone = [program.exists * (a + b) for a, b in zip(adjoint, stiff, strict=True)]
@@ -149,43 +149,41 @@ def _bounded(frame: JordanFrame, limit: float) -> JordanFrame:
 def _orthonormal(triangle: Cholesky, columns: Cone) -> Cone:
     """``L^-1 B`` over E."""
     m = len(triangle.inverse)
-    solved = [solve_lower(triangle, tuple(c[i] for i in range(m))) for c in columns]
+    solved = tuple(solve_lower(triangle, c[:m]) for c in columns)
     return _over(solved, tuple(c[m:] for c in columns))
 
 
 @stage
-def _over(upper: list[Vector], lower: Cone) -> Cone:
-    return tuple(jnp.concatenate([jnp.stack(a), b]) for a, b in zip(upper, lower, strict=True))
+def _over(upper: Cone, lower: Cone) -> Cone:
+    return tuple(jnp.concatenate([a, b]) for a, b in zip(upper, lower, strict=True))
 
 
 def _scaled(frame: JordanFrame, triangle: Cholesky, rhs: KKTVector) -> ScaledSides:
     """``rhs`` in scaled coordinates, its equations multiplied by L^-1."""
-    solved = solve_lower(triangle, as_vector(rhs.y))
+    solved = solve_lower(triangle, rhs.y)
     h, head, rows = _sides(frame, rhs.u, solved, rhs.beta)
     return ScaledSides(h, head, rhs.xi, rows)
 
 
 @stage
-def _sides(frame: JordanFrame, u: Cone, y: Vector, beta: OptionalArray) -> tuple[Cone, Array, Array]:
-    rows = jnp.stack(y)
-    if beta is not None:
-        rows = jnp.concatenate([rows, beta])
+def _sides(frame: JordanFrame, u: Cone, y: Array, beta: OptionalArray) -> tuple[Cone, Array, Array]:
+    rows = y if beta is None else jnp.concatenate([y, beta])
     return frame.scale(frame.to_frame(u)), jnp.zeros_like(u[0]), rows
 
 
 def _unscaled(
     program: ConvexConeProgram, frame: JordanFrame, triangle: Cholesky, x: ScaledDirection
 ) -> KKTVector:
-    y = solve_transposed(triangle, as_vector(x.rows[: program.rhs.shape[0]]))
+    y = solve_transposed(triangle, x.rows[: program.rhs.shape[0]])
     return _vector(program.exists, frame, x, y, program.bound)
 
 
 @stage
 def _vector(
-    exists: Array, frame: JordanFrame, x: ScaledDirection, y: Vector, bound: OptionalArray
+    exists: Array, frame: JordanFrame, x: ScaledDirection, y: Array, bound: OptionalArray
 ) -> KKTVector:
     u = tuple(exists * a for a in frame.from_frame(frame.scale(x.p)))
-    return KKTVector(u, jnp.stack(y), x.xi, None if bound is None else x.rows[len(y) :])
+    return KKTVector(u, y, x.xi, None if bound is None else x.rows[y.shape[0] :])
 
 
 @stage

@@ -17,7 +17,7 @@ from ..core import Array, complementary_ratio, largest_response
 from .cone import Cone, cone_max
 from .convex_cone_program import Bounds, ConvexConeProgram, ConvexPoint
 from .jordan_frame import JordanFrame
-from .products import as_vector, vector_norm
+from .products import vector_norm
 from .reduced_kkt import ReducedKKT, reduced_kkt
 from .scaled_kkt import ScaledDirection, ScaledSides, factor_scaled_kkt
 
@@ -101,7 +101,7 @@ def _strict_and_unique(
             separated(slack, price, mask)
 
     du = kkt.frame.from_frame(kkt.frame.scale(response.p))
-    size = vector_norm(as_vector(response.rows))
+    size = vector_norm(response.rows)
     for a, x in zip(effective, du, strict=True):
         size = jnp.maximum(size, cone_max(a * jnp.abs(x)))
     if response.xi is not None:

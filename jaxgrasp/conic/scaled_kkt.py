@@ -29,7 +29,7 @@ from .cone_blocks import ConeBlocks, factor_blocks
 from .convex_cone_program import Bounds, ConvexConeProgram, OptionalArray
 from .gram_schmidt import orthonormal_rows
 from .jordan_frame import JordanFrame
-from .products import Vector, as_vector, matvec, rmatvec
+from .products import matvec, rmatvec
 
 __all__ = ["ScaledDirection", "ScaledKKT", "ScaledSides", "factor_scaled_kkt"]
 
@@ -68,7 +68,7 @@ class ScaledKKT(NamedTuple):
 
     def solve(self, rhs: ScaledSides) -> ScaledDirection:
         """By projection: the unconstrained solution, moved along the rows of Q until ``R W p = rows``."""
-        target = solve_lower(self.triangle, as_vector(rhs.rows))
+        target = solve_lower(self.triangle, rhs.rows)
         free = _unconstrained(self.blocks, self.border, rhs)
         components = _components(self.basis, free, target)
         multipliers = solve_transposed(self.triangle, components)
@@ -99,30 +99,30 @@ _product = stage(matvec)
 
 
 @stage
-def _difference(product: Array, target: Vector) -> Vector:
-    return tuple(product[i] - x for i, x in enumerate(target))
+def _difference(product: Array, target: Array) -> Array:
+    return product - target
 
 
-def _components(basis: Cone, free: Cone, target: Vector) -> Vector:
+def _components(basis: Cone, free: Cone, target: Array) -> Array:
     """``Q free - target``."""
     return _difference(_product(basis[: len(free)], free), target)
 
 
 @stage
-def _projected(basis: Cone, free: Cone, components: Vector) -> Cone:
+def _projected(basis: Cone, free: Cone, components: Array) -> Cone:
     """``free - Q^T components``."""
     return tuple(a - b for a, b in zip(free, rmatvec(basis[: len(free)], components), strict=True))
 
 
 @stage
 def _back_substituted(
-    blocks: ConeBlocks, border: Border | None, p: Cone, multipliers: Vector
+    blocks: ConeBlocks, border: Border | None, p: Cone, multipliers: Array
 ) -> ScaledDirection:
     xi = None
     if border is not None:
         xi = p[-1][0] * border.inverse_root
         p = tuple(a + b * xi for a, b in zip(p[:-1], border.column, strict=True))
-    return ScaledDirection(blocks.solve_upper(p), xi, jnp.stack(multipliers))
+    return ScaledDirection(blocks.solve_upper(p), xi, multipliers)
 
 
 @stage
@@ -172,12 +172,12 @@ def _blocks(frame: JordanFrame, program: ConvexConeProgram, rates: Bounds) -> Co
 
 
 @stage
-def _relative_floors(columns: Cone, share: float) -> Vector:
+def _relative_floors(columns: Cone, share: float) -> list[Array]:
     """``share`` of the length of each row."""
-    return tuple(
+    return [
         share * jnp.sqrt(cone_sum(jnp.concatenate([c[i] * c[i] for c in columns])))
         for i in range(columns[0].shape[0])
-    )
+    ]
 
 
 def factor_scaled_kkt(

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from ..backend import stage, to_lanes
-from ..conic import Cone, Vector, cone_all, cone_any, cone_max, cone_sum
+from ..conic import Cone, cone_all, cone_any, cone_max, cone_sum
 from ..core import Array, cross_components, frame_components, normalize_components
 from .grasp import Grasp
 from .models import Component
@@ -32,7 +32,7 @@ class Folded(NamedTuple):
     columns  d arrays (m, k, L): normal column first, then the scaled tangents and spin
     exists   (k, L) ones and zeros      count   (L,) active contacts
     length   (L,) L in m                valid   (L,) bool: the numbers are a grasp
-    norm     (L,) Frobenius norm of A   resultant  m arrays (L,): a, the wrench of unit normal forces
+    norm     (L,) Frobenius norm of A   resultant  (m, L): a, the wrench of unit normal forces
     """
 
     columns: Cone
@@ -41,7 +41,7 @@ class Folded(NamedTuple):
     length: Array
     valid: Array
     norm: Array
-    resultant: Vector
+    resultant: Array
 
 
 @stage
@@ -79,8 +79,8 @@ def _spin_column(normal: tuple[Array, ...], factor: Array) -> Array:
 
 
 @stage
-def resultant(normal_column: Array) -> Vector:
-    return tuple(cone_sum(normal_column[i]) for i in range(normal_column.shape[0]))
+def resultant(normal_column: Array) -> Array:
+    return cone_sum(normal_column.swapaxes(0, 1))
 
 
 @stage

@@ -10,8 +10,6 @@ from ..backend import stage, to_lanes
 from ..conic import (
     Cholesky,
     Cone,
-    Vector,
-    as_vector,
     cone_min,
     cone_sum,
     interior_distance,
@@ -90,23 +88,23 @@ def tile_of(contacts: Contacts, components: tuple[Component, ...], dimension: in
     return Tile(contacts, folded, project(folded), components, dimension)
 
 
-def to_body(twist: Vector, length: Array, dimension: int) -> Vector:
+def to_body(twist: Array, length: Array, dimension: int) -> Array:
     """(velocity; angular velocity) in m/s and rad/s of a twist of A, whose lengths are over ``length``."""
-    return tuple(x if i < dimension else x / length for i, x in enumerate(twist))
+    return jnp.concatenate([twist[:dimension], twist[dimension:] / length])
 
 
-def to_twist(projection: Projection, y: Vector) -> Vector:
+def to_twist(projection: Projection, y: Array) -> Array:
     """The twist lambda of A for the multipliers y of Q: ``A^T lambda = Q^T y``, ``lambda = L^-T y``."""
     return solve_transposed(projection.factor, y)
 
 
 @stage
-def _applied(columns: Cone, s: Cone) -> Vector:
-    return as_vector(matvec(columns, s))
+def _applied(columns: Cone, s: Cone) -> Array:
+    return matvec(columns, s)
 
 
 @stage
-def minus_transposed(columns: Cone, s: Cone, y: Vector) -> Cone:
+def minus_transposed(columns: Cone, s: Cone, y: Array) -> Cone:
     """``s - A^T y`` for the columns of A, contact by contact."""
     return tuple(a - b for a, b in zip(s, rmatvec(columns, y), strict=True))
 

@@ -16,8 +16,6 @@ from ..conic import (
     ConvexConeProgram,
     ConvexPoint,
     ConvexState,
-    Vector,
-    as_vector,
     cone_max,
     cone_sum,
     inner,
@@ -80,8 +78,8 @@ class Multipliers(NamedTuple):
 
     rows: Array
     ray: Array
-    twist: Vector
-    escape: Vector
+    twist: Array
+    escape: Array
 
 
 @stage
@@ -89,7 +87,7 @@ def _polished(basis: Cone, rhs: Array, exists: Array, u: Cone) -> Cone:
     """The nearest point with ``Q u = b``, twice, so that what is left is rounding."""
     for _ in range(2):
         applied = matvec(basis, u)
-        back = rmatvec(basis, as_vector(rhs - applied))
+        back = rmatvec(basis, rhs - applied)
         u = tuple(exists * (a + b) for a, b in zip(u, back, strict=True))
     return u
 
@@ -141,9 +139,7 @@ def answer(problem: ForceProblem, state: ConvexState, tolerance: Array) -> Answe
     rows, ray = _all_rows(state.point), _to_size_one(state.ray)
     values = _values(problem, state.point, u, rows)
 
-    found = Multipliers(
-        rows, ray, to_twist(projection, as_vector(rows[:m])), to_twist(projection, as_vector(ray[:m]))
-    )
+    found = Multipliers(rows, ray, to_twist(projection, rows[:m]), to_twist(projection, ray[:m]))
     load = load._replace(rest=load.rest & (problem.demand.criterion.barrier_weight is None))
     status = _status(
         Lanes(problem.valid, load.off, load.rest, state.stop),
@@ -189,7 +185,7 @@ def _to_size_one(ray: Array) -> Array:
 def _rounding(program: ConvexConeProgram, rows: Array, u: Cone, size: Array) -> Array:
     """What rounding can do to the bound of multipliers as large as ``rows``."""
     forces = jnp.sqrt(cone_sum(program.exists * inner(u, u)))
-    blur = vector_norm(as_vector(rows)) * (vector_norm(as_vector(program.rhs)) + forces) * size
+    blur = vector_norm(rows) * (vector_norm(program.rhs) + forces) * size
     blur = jnp.asarray(8 * unit_roundoff(blur.dtype), blur.dtype) * blur
     return blur * size if program.curvature is not None else blur
 
@@ -213,7 +209,7 @@ def _in_user_units(
     ) -> tuple[Array, ...]:  # fmt: skip
         optimal, infeasible = status == Status.OPTIMAL.value, status == Status.INFEASIBLE.value
         invalid, cost, bound = status == Status.INVALID.value, values.cost, values.bound
-        m = len(found.twist)
+        m = found.twist.shape[0]
         nan, inf = jnp.full_like(cost, jnp.nan), jnp.full_like(cost, jnp.inf)
         zero = jnp.zeros_like(cost)
 
@@ -226,14 +222,13 @@ def _in_user_units(
         cost = final(jnp.where(resting, zero, cost), inf, infeasible)
         bound = final(jnp.where(resting, zero, bound), inf, infeasible)
         bound = jnp.where(bound < cost, bound, cost)
-        escape = tuple(jnp.where(load.off, a, b) for a, b in zip(load.twist, found.escape, strict=True))
-        escape = to_body(escape, length, tile.dimension)
+        escape = to_body(jnp.where(load.off, load.twist, found.escape), length, tile.dimension)
         size = vector_norm(escape)
         size = jnp.where((size > 0) & jnp.isfinite(size), size, jnp.ones_like(size))
-        escape = jnp.stack([final(jnp.where(infeasible, x / size, zero), zero, zero > 1) for x in escape])
+        escape = final(jnp.where(infeasible, escape / size, zero), zero, zero > 1)
         back = load.size if squared else jnp.ones_like(load.size)
-        twist = tuple(back * x for x in to_body(found.twist, length, tile.dimension))
-        twist = jnp.stack([final(x, zero, infeasible | resting) for x in twist])
+        twist = back * to_body(found.twist, length, tile.dimension)
+        twist = final(twist, zero, infeasible | resting)
         rates = jnp.zeros((0, *cost.shape), cost.dtype)
         if row_norm is not None:
             beta = jnp.where(infeasible, found.ray[m:] / size, back * found.rows[m:]) / row_norm

@@ -15,7 +15,6 @@ from ..conic import (
     Cone,
     ConvexConeProgram,
     Curvature,
-    as_vector,
     cone_max,
     cone_sum,
     determinant,
@@ -23,6 +22,7 @@ from ..conic import (
     interior_distance,
     rmatvec,
     tail_norm,
+    vector_inner,
 )
 from ..core import Array
 
@@ -84,13 +84,11 @@ class DualPoint(NamedTuple):
 @stage
 def _dual_point(program: ConvexConeProgram, rows: Array) -> DualPoint:
     m = program.rhs.shape[0]
-    gain = -program.rhs[0] * rows[0]
-    for i in range(1, m):
-        gain = gain - program.rhs[i] * rows[i]
+    gain = -vector_inner(program.rhs, rows)
     if program.bound is not None:
         for j in range(program.bound.shape[0]):
             gain = gain - jnp.abs(rows[m + j]) * program.bound[j]
-    return DualPoint(rmatvec(program.columns, as_vector(rows)), gain)
+    return DualPoint(rmatvec(program.columns, rows), gain)
 
 
 def _level_multipliers(violation: Array, cap: Array | None, total: Array) -> Array:

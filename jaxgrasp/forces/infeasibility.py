@@ -9,7 +9,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from ..backend import stage
-from ..conic import ConvexConeProgram, Vector, as_vector, cone_sum, rmatvec, tail_norm, vector_norm
+from ..conic import ConvexConeProgram, cone_sum, rmatvec, tail_norm, vector_inner, vector_norm
 from ..contacts import Folded
 from ..core import Array, rounding_constant, unit_roundoff
 from .problem import Load
@@ -27,7 +27,7 @@ def separation(program: ConvexConeProgram, rows: Array, limit: float) -> Array:
     ``limit`` times the load and torques up to their bounds can take up. Without limits: ``A_i^T y`` is in every cone.
     """
     m = program.rhs.shape[0]
-    x = rmatvec(program.columns, as_vector(rows))
+    x = rmatvec(program.columns, rows)
     violation = program.exists * jnp.maximum(tail_norm(x) - x[0], jnp.zeros_like(x[0]))
     most = jnp.full_like(violation, limit)
     if program.cap is not None:
@@ -36,9 +36,7 @@ def separation(program: ConvexConeProgram, rows: Array, limit: float) -> Array:
     if program.bound is not None:
         for j in range(program.bound.shape[0]):
             taken = taken + jnp.abs(rows[m + j]) * program.bound[j]
-    power = -program.rhs[0] * rows[0]
-    for i in range(1, m):
-        power = power - program.rhs[i] * rows[i]
+    power = -vector_inner(program.rhs, rows)
     worth = power > 0
     return jnp.where(worth, 1 - taken / jnp.where(worth, power, jnp.ones_like(power)), -jnp.ones_like(power))
 
@@ -50,7 +48,7 @@ def proves(program: ConvexConeProgram, rows: Array) -> Array:
 
 @stage
 def proven_separation(
-    folded: Folded, program: ConvexConeProgram, twist: Vector, beta: Array | None, load: Load, limit: float
+    folded: Folded, program: ConvexConeProgram, twist: Array, beta: Array | None, load: Load, limit: float
 ) -> Array:
     """Power of the load along ``twist`` less what forces up to ``limit`` loads and the torques can take up, on A.
 
@@ -60,8 +58,8 @@ def proven_separation(
     x, blur = rmatvec(folded.columns, twist), folded.norm * vector_norm(twist)
     if beta is not None:
         joints = tuple(c[program.rhs.shape[0] :] for c in program.columns)
-        x = tuple(a + b for a, b in zip(x, rmatvec(joints, as_vector(beta)), strict=True))
-        blur = blur + vector_norm(as_vector(beta))
+        x = tuple(a + b for a, b in zip(x, rmatvec(joints, beta), strict=True))
+        blur = blur + vector_norm(beta)
     violation = program.exists * jnp.maximum(tail_norm(x) - x[0] + rounding * blur, jnp.zeros_like(x[0]))
     outer = vector_norm(load.wrench)
     most = jnp.broadcast_to(limit * outer, violation.shape)
@@ -71,7 +69,5 @@ def proven_separation(
     if beta is not None:
         for j in range(beta.shape[0]):
             taken = taken + jnp.abs(beta[j]) * program.bound[j] * load.size
-    power = twist[0] * load.wrench[0]
-    for a, b in zip(twist[1:], load.wrench[1:], strict=True):
-        power = power + a * b
+    power = vector_inner(twist, load.wrench)
     return power - rounding * vector_norm(twist) * outer - taken

@@ -20,8 +20,6 @@ from ..conic import (
     Cone,
     ConvexConeProgram,
     Curvature,
-    Vector,
-    as_vector,
     null_combination,
     residual_lower,
     solve_lower,
@@ -63,17 +61,17 @@ class Demand(NamedTuple):
 class Load(NamedTuple):
     """The load of a tile in the metric of A.
 
-    wrench  m arrays (L,): force and torque / L     rhs     (m, L): b
+    wrench  (m, L): force and torque / L            rhs     (m, L): b
     size    (L,) N: forces are ``size u``           off     (L,) bool: outside the range of A
-    twist   m arrays (L,): for lanes that are off, a twist no force can oppose, with positive power of the load
+    twist   (m, L): for lanes that are off, a twist no force can oppose, with positive power of the load
     rest    (L,) bool: no load at all
     """
 
-    wrench: Vector
+    wrench: Array
     rhs: Array
     size: Array
     off: Array
-    twist: Vector
+    twist: Array
     rest: Array
 
 
@@ -103,7 +101,7 @@ def _scaled_wrench(force: Array, torque: Array, length: Array) -> tuple[Array, A
 
 @stage
 def _load_size(
-    inner: Vector, residual: Vector, wrench: Vector, norm: Array, weight: Array | None
+    inner: Array, residual: Array, wrench: Array, norm: Array, weight: Array | None
 ) -> tuple[Array, Array, Array, Array]:
     """b, the size, whether the load is off the range, whether there is none."""
     dtype = norm.dtype
@@ -113,7 +111,7 @@ def _load_size(
     rest = outer == 0
     total = size if weight is None else size + weight
     total = jnp.where(total > 0, total, jnp.ones_like(total))
-    return jnp.stack([-x / total for x in inner]), total, off, rest
+    return -inner / total, total, off, rest
 
 
 def load_of(tile: Tile, demand: Demand) -> tuple[Load, Array]:
@@ -121,10 +119,9 @@ def load_of(tile: Tile, demand: Demand) -> tuple[Load, Array]:
     folded, factor = tile.folded, tile.projection.factor
     wrench = to_lanes(demand.wrench)
     rows, finite = _scaled_wrench(wrench[: tile.dimension], wrench[tile.dimension :], folded.length)
-    outer = as_vector(rows)
-    inner, residual = solve_lower(factor, outer), residual_lower(factor, outer)
-    rhs, size, off, rest = _load_size(inner, residual, outer, folded.norm, demand.criterion.barrier_weight)
-    return Load(outer, rhs, size, off, null_combination(factor, residual), rest), finite
+    inner, residual = solve_lower(factor, rows), residual_lower(factor, rows)
+    rhs, size, off, rest = _load_size(inner, residual, rows, folded.norm, demand.criterion.barrier_weight)
+    return Load(rows, rhs, size, off, null_combination(factor, residual), rest), finite
 
 
 @stage

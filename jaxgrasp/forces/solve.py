@@ -19,7 +19,7 @@ from jax.typing import ArrayLike
 
 from ..backend import Sweeps, batched, in_chunks, in_sweeps, is_traced, tile_width, to_lanes, to_rows
 from ..certificates import check_forces, checked_by, force_claim
-from ..conic import ConvexState, as_vector, begin_convex_cone_program, regular, solve_convex_cone_program
+from ..conic import ConvexState, begin_convex_cone_program, regular, solve_convex_cone_program
 from ..contacts import Component, Grasp, TorqueLimits, tile_of, to_twist
 from ..core import (
     Answer,
@@ -171,8 +171,8 @@ def _progress(plan: _Plan, problem: ForceProblem, state: ConvexState, result: La
         return _Progress(state, result, smooth, None, None)
     tile = problem.tile
     scales = Scales(tile.folded.length, problem.load.size, tile.projection.factor, problem.row_norm)
-    y = to_twist(tile.projection, as_vector(state.point.y))
-    return _Progress(state, result, smooth, scales, jnp.stack(y))
+    y = to_twist(tile.projection, state.point.y)
+    return _Progress(state, result, smooth, scales, y)
 
 
 def _solve_rows(plan: _Plan, rows: Rows, count: Array, tolerance: Array) -> Solved:

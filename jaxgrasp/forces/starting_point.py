@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from ..backend import stage
-from ..conic import Bounds, Cone, ConvexConeProgram, ConvexPoint, as_vector, cone_max, rmatvec, tail_norm
+from ..conic import Bounds, Cone, ConvexConeProgram, ConvexPoint, cone_max, rmatvec, tail_norm
 from ..core import Array
 from .problem import ForceProblem
 
@@ -16,7 +16,7 @@ __all__ = ["starting_point"]
 def _first_forces(program: ConvexConeProgram, basis: Cone, count: Array) -> tuple[Cone, Array]:
     """The least-norm forces, pressed into the cones: ``u = Q^T b + depth e``."""
     exists = program.exists
-    least = rmatvec(basis, as_vector(program.rhs))
+    least = rmatvec(basis, program.rhs)
     depth = 1 + cone_max(exists * jnp.maximum(tail_norm(least) - least[0], jnp.zeros_like(exists)))
     if program.cone_floor is not None and program.head_floor is not None:
         depth = jnp.maximum(depth, count * cone_max(program.cone_floor + program.head_floor))

@@ -88,7 +88,7 @@ def _program(form: _Form, contacts: Contacts, scales: Scales) -> ConvexConeProgr
     """``margin_program`` of A itself as a differentiable function of the contacts."""
     program = margin_program(fold(contacts, form.components, scales.length))
     none = (None,) * 7
-    return ConvexConeProgram(program.columns, jnp.stack(program.rhs), program.exists, program.cost[0], *none)
+    return ConvexConeProgram(program.columns, program.rhs, program.exists, program.cost[0], *none)
 
 
 def _centring(form: _Form, contacts: Contacts, scales: Scales, point: ConvexPoint) -> PointShift:

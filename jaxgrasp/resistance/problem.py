@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from ..backend import stage
-from ..conic import Cone, LinearConeProgram, LinearPoint, Vector, cone_max, cone_sum, inner, tail_norm
+from ..conic import Cone, LinearConeProgram, LinearPoint, cone_max, cone_sum, inner, tail_norm, vector_inner
 from ..contacts import (
     Folded,
     Projection,
@@ -85,13 +85,13 @@ def starting_point(folded: Folded, projection: Projection) -> Start:
     z = (share, *(jnp.zeros_like(share) for _ in s[1:]))
     # A lane the projection already refutes keeps its twist as the dual point.
     keep = escape | unbounded
-    dual = tuple(jnp.where(keep, -v, jnp.zeros_like(v)) for v in y)
+    dual = jnp.where(keep, -y, jnp.zeros_like(y))
     return Start(LinearPoint(dual, u, z), lower, escape, unbounded)
 
 
 @stage
-def _deflated(normal_column: Array, resultant: Vector, share: Array) -> Array:
-    return jnp.stack([normal_column[i] - r * share for i, r in enumerate(resultant)])
+def _deflated(normal_column: Array, resultant: Array, share: Array) -> Array:
+    return normal_column - resultant[:, None] * share
 
 
 def margin_program(folded: Folded) -> LinearConeProgram:
@@ -99,8 +99,9 @@ def margin_program(folded: Folded) -> LinearConeProgram:
     share = folded.exists / folded.count
     first = _deflated(folded.columns[0], folded.resultant, share)
     cost = (share, *(jnp.zeros_like(share) for _ in folded.columns[1:]))
-    rhs = tuple(-r for r in folded.resultant)
-    return LinearConeProgram((first, *folded.columns[1:]), rhs, cost, folded.exists, constant=-1.0)
+    return LinearConeProgram(
+        (first, *folded.columns[1:]), -folded.resultant, cost, folded.exists, constant=-1.0
+    )
 
 
 @stage
@@ -110,19 +111,17 @@ def _gauge(exists: Array, count: Array, v: Cone) -> Array:
     return count * worst - cone_sum(exists * v[0])
 
 
-def upper_bound(folded: Folded, y: Vector) -> Array:
+def upper_bound(folded: Folded, y: Array) -> Array:
     """``1 + a.y / rho(y)`` with ``rho(y) = k max_i (v_n,i + |v_t,i|) - sum_i v_n,i``, ``v = A^T y``: t* is not larger.
 
     1 / rho is the largest multiple of y that the dual admits, so the bound needs no feasible y. rho grows by the
     rounding of v: where t* is hugely negative it is the small difference of large sums, and t* follows it squared.
     """
     zero = tuple(jnp.zeros_like(folded.exists) for _ in folded.columns)
-    v = minus_transposed(folded.columns, zero, tuple(-x for x in y))
+    v = minus_transposed(folded.columns, zero, -y)
     rounding = 4 * unit_roundoff(folded.norm.dtype) * folded.count * stored_norm(y)
     gauge = _gauge(folded.exists, folded.count, v) + rounding
-    descent = folded.resultant[0] * y[0]
-    for a, b in zip(folded.resultant[1:], y[1:], strict=True):
-        descent = descent + a * b
+    descent = vector_inner(folded.resultant, y)
     useful = (descent < 0) & (gauge > 0)
     return 1 + jnp.where(
         useful, descent / jnp.where(useful, gauge, jnp.ones_like(gauge)), jnp.zeros_like(gauge)

@@ -38,6 +38,7 @@ from ..conic import (
     cone_sum,
     row_svd,
     solve_linear_cone_program,
+    vector_norm,
 )
 from ..contacts import Component, Contacts, Folded, Grasp, Tile, contacts_of, fold, tile_of, to_twist
 from ..core import (
@@ -143,10 +144,7 @@ def _decision(folded: Folded, sigma: Array) -> Callable[[LinearConeProgram, Line
     def decided(program: LinearConeProgram, point: LinearPoint) -> Array:
         lower = -program.primal_value(point.u)
         upper = -program.dual_value(point.y)
-        square = point.y[0] * point.y[0]
-        for v in point.y[1:]:
-            square = square + v * v
-        return (lower > room) | (upper < -room * jnp.sqrt(square))
+        return (lower > room) | (upper < -room * vector_norm(point.y))
 
     return decided
 
@@ -207,7 +205,7 @@ def _begin(plan: _Plan, lanes: _Lanes) -> LinearState:
     """The state before the first step; what the projection of unit forces decides needs none."""
     folded, start = lanes.tile.folded, lanes.start
     refuted = start.unbounded | (start.escape if plan.verdict_only else jnp.zeros_like(start.escape))
-    dual = tuple(jnp.where(refuted, v, jnp.zeros_like(v)) for v in start.point.y)
+    dual = jnp.where(refuted, start.point.y, jnp.zeros_like(start.point.y))
     state = begin_linear_cone_program(lanes.program, start.point._replace(y=dual), ~folded.valid | refuted)
     if not plan.verdict_only:
         return state
@@ -221,7 +219,7 @@ def _progress(plan: _Plan, lanes: _Lanes, state: LinearState, tolerance: Array) 
     scales = multipliers = None
     if plan.with_point:
         scales = Scales(tile.folded.length, tile.projection.factor)
-        multipliers = jnp.stack(to_twist(tile.projection, point.y))
+        multipliers = to_twist(tile.projection, point.y)
     doubtful = lanes.doubtful.astype(jnp.int32)
     return jax.tree.map(to_rows, _Progress(state, verdict, doubtful, scales, multipliers))
 

@@ -74,7 +74,7 @@ def trace(grasp: Grasp, *, tolerance: float = 1e-8, max_iterations: int = TOTAL_
     def first(rows: Contacts) -> LinearState:
         folded, projection, program = _tile(rows, components)
         start = starting_point(folded, projection)
-        dual = tuple(jnp.where(start.unbounded, v, jnp.zeros_like(v)) for v in start.point.y)
+        dual = jnp.where(start.unbounded, start.point.y, jnp.zeros_like(start.point.y))
         return begin_linear_cone_program(
             program, start.point._replace(y=dual), ~folded.valid | start.unbounded
         )

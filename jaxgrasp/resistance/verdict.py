@@ -11,18 +11,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from ..backend import stage
-from ..conic import (
-    Cone,
-    Vector,
-    as_vector,
-    cone_min,
-    cone_sum,
-    inner,
-    interior_distance,
-    matvec,
-    rmatvec,
-    vector_norm,
-)
+from ..conic import Cone, cone_min, cone_sum, inner, interior_distance, matvec, rmatvec, vector_norm
 from ..contacts import Folded, Tile, normalized, onto_null_space, smallest_slack, to_body, to_twist, unfold
 from ..core import Array, Status, first_of, rank_tolerance, rounding_constant, unit_roundoff
 from .problem import upper_bound
@@ -69,7 +58,7 @@ class Dual(NamedTuple):
     """
 
     upper: Array
-    twist: Vector
+    twist: Array
     escapes: Array
     deficient: Array
 
@@ -85,18 +74,18 @@ class Bracket(NamedTuple):
 @stage
 def _norms(columns: Cone, s: Cone) -> tuple[Array, Array]:
     """``|A s|`` and ``|s|``."""
-    return vector_norm(as_vector(matvec(columns, s))), jnp.sqrt(cone_sum(inner(s, s)))
+    return vector_norm(matvec(columns, s)), jnp.sqrt(cone_sum(inner(s, s)))
 
 
 @stage
-def _unit_twist(y: Vector) -> Vector:
+def _unit_twist(y: Array) -> Array:
     size = vector_norm(y)
     safe = jnp.where((size > 0) & jnp.isfinite(size), size, jnp.ones_like(size))
-    return tuple(v / safe for v in y)
+    return y / safe
 
 
 @stage
-def _escape_depth(columns: Cone, exists: Array, xi: Vector, rounding: Array) -> Array:
+def _escape_depth(columns: Cone, exists: Array, xi: Array, rounding: Array) -> Array:
     """``min_i x_0,i - |x_1..,i| - c eps |A_i|`` with ``x = A^T xi``: positive proves that xi escapes."""
     x = rmatvec(columns, xi)
     square = None
@@ -109,19 +98,19 @@ def _escape_depth(columns: Cone, exists: Array, xi: Vector, rounding: Array) -> 
 
 
 @stage
-def _unseen(columns: Cone, xi: Vector) -> Array:
+def _unseen(columns: Cone, xi: Array) -> Array:
     """``|A^T xi|``: zero for a twist that no contact notices."""
     x = rmatvec(columns, xi)
     return jnp.sqrt(cone_sum(inner(x, x)))
 
 
-def judge(tile: Tile, rank: Rank, u: Cone, y: Vector, unbounded: Array, tolerance: Array) -> Verdict:
+def judge(tile: Tile, rank: Rank, u: Cone, y: Array, unbounded: Array, tolerance: Array) -> Verdict:
     """Certify one tile at the solver's forces u and multipliers y.
 
     rank       consulted only where the projection could not prove full rank itself
     unbounded  (L,) bool: t* = -inf
     """
-    folded, m = tile.folded, len(y)
+    folded, m = tile.folded, y.shape[0]
     count = jnp.where(tile.projection.sigma > 0, m * jnp.ones_like(folded.norm), rank.count)
     full_rank = count >= m
     primal = _primal_evidence(tile, rank, full_rank, u)
@@ -130,7 +119,7 @@ def judge(tile: Tile, rank: Rank, u: Cone, y: Vector, unbounded: Array, toleranc
     status = _status(folded.valid, full_rank, primal, dual, bracket, tolerance)
 
     force = unfold(primal.s, tile.components, *tile.coefficients)
-    twist = jnp.stack(_unit_twist(to_body(dual.twist, folded.length, tile.dimension)))
+    twist = _unit_twist(to_body(dual.twist, folded.length, tile.dimension))
     twist = jnp.where(status == Status.RESISTANT.value, jnp.zeros_like(twist), twist)
     one = jnp.ones_like(folded.norm)
 
@@ -171,7 +160,7 @@ def _primal_evidence(tile: Tile, rank: Rank, full_rank: Array, u: Cone) -> Prima
     return Primal(s, slack, jnp.where(certain, near, jnp.zeros_like(near)), certain & (shift < slack))
 
 
-def _dual_evidence(tile: Tile, rank: Rank, full_rank: Array, y: Vector) -> Dual:
+def _dual_evidence(tile: Tile, rank: Rank, full_rank: Array, y: Array) -> Dual:
     """The bound of t*, and the twist behind it.
 
     Where t* is huge and negative the iterates may stall, but the twist of the projection still escapes.
@@ -179,16 +168,16 @@ def _dual_evidence(tile: Tile, rank: Rank, full_rank: Array, y: Vector) -> Dual:
     folded, basis = tile.folded, tile.projection.basis
     simple = basis.resultant
     upper = upper_bound(basis, y)
-    bound = upper_bound(basis, tuple(-v for v in simple))
+    bound = upper_bound(basis, -simple)
     better = bound < upper
-    opposing = tuple(jnp.where(better, a, -b) for a, b in zip(simple, y, strict=True))
+    opposing = jnp.where(better, simple, -y)
     xi = _unit_twist(to_twist(tile.projection, opposing))
     escapes = _escape_depth(folded.columns, folded.exists, xi, _rounding(folded)) > 0
-    null = as_vector(rank.null_twist)
+    null = rank.null_twist
     unseen = _unseen(folded.columns, null) <= rank_tolerance(folded.norm.dtype) * folded.norm
     deficient = ~full_rank & unseen
     use_null = deficient & ~escapes
-    twist = tuple(jnp.where(use_null, b, a) for a, b in zip(xi, null, strict=True))
+    twist = jnp.where(use_null, null, xi)
     return Dual(jnp.where(better, bound, upper), twist, escapes, deficient)
 
 
