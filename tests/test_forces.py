@@ -97,6 +97,46 @@ def test_limits_bind_at_their_bound_and_forbid_beyond_it(dtype):
     assert jg.check(grasp, out, **asked).all()
 
 
+def soft_or_hard(kind, k, dtype):
+    """Random contacts of 40 grasps."""
+    rng = np.random.default_rng(6)
+    position = rng.normal(size=(40, k, 3)).astype(dtype)
+    mu = rng.uniform(0.3, 1, (40, k)).astype(dtype)
+    return jg.Grasp(position, -position, jg.SoftFinger(mu, 0.1 * mu) if kind == "soft" else jg.HardFinger(mu))
+
+
+LARGE = [
+    pytest.param("soft", 6, "float32", jg.Robust(0.7), 0),
+    *(
+        pytest.param(*kind, marks=pytest.mark.slow)
+        for kind in (
+            ("soft", 12, "float32", jg.Robust(0.7), 7),
+            ("soft", 16, "float64", jg.Robust(0.7), 7),
+            ("soft", 24, "float32", jg.LeastNorm(0.2), 14),
+            ("hard", 24, "float64", jg.Gentlest(), 16),
+            ("hard", 4, "float32", jg.SmallestSum(), 29),
+        )
+    ),
+]
+
+
+@pytest.mark.parametrize(("kind", "k", "kept", "criterion", "joints"), LARGE)
+def test_large_problems_compile(kind, k, kept, criterion, joints):
+    """XLA splits what it finds expensive over threads, and long reductions into windows; a kernel can hold neither."""
+    grasp, rng = soft_or_hard(kind, k, kept), np.random.default_rng(7)
+    wrench = rng.normal(size=(40, 6)).astype(kept)
+    limits = None
+    if joints:
+        J = 0.1 * rng.normal(size=(40, k * grasp.model.force_size(3), joints)).astype(kept)
+        limits = (J, np.full(joints, 2.0, kept))
+    asked = {"criterion": criterion, "max_normal": rng.uniform(2, 20, (40, k)).astype(kept)}
+    asked["torque_limits"] = limits
+    out = jg.optimize_forces(grasp, wrench, **asked)
+    proved = np.isin(np.asarray(out.status), [Status.OPTIMAL, Status.INFEASIBLE])
+    assert proved.mean() > 0.9
+    assert np.asarray(jg.check(grasp, out, wrench=wrench, **asked))[proved].all()
+
+
 def test_a_limit_that_bites_is_met_exactly(dtype):
     """Fingers at 0, 90 and 180 degrees and a push of 2 N towards the one at 90: SmallestSum loads it as far as the cap
     allows."""

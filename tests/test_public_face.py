@@ -329,7 +329,7 @@ def turns(rng, count, dimension):
 def test_torque_limits_mean_the_same_in_all_axes(name):
     """The motors' torques J^T f are the same numbers, so the answer is; each is proved for the limits as given."""
     dimension, k, model = CASES[name]
-    count, joints, rng = 12, 2, np.random.default_rng(3)
+    count, joints, rng = 12, 7, np.random.default_rng(3)  # as many motors as an arm has
     grasp = random_grasp(4, count, k, dimension, model)
     wrench = rng.normal(size=(count, 3 if dimension == 2 else 6)) * (
         [1.0] * dimension + [0.02] * (2 * dimension - 3)

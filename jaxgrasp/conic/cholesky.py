@@ -5,6 +5,7 @@ The m x m structure (m = 3 or 6) is unrolled; each line below is vector code ove
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -33,27 +34,27 @@ class Cholesky(NamedTuple):
 
 
 @stage
-def _schur_column(column: Array, previous: list[tuple[Array, Array]]) -> Array:
-    for below, head in previous:
-        column = column - below * head
+def _schur_column(column: Array, before: list[Array]) -> Array:
+    """``M[j:, j] - sum_q L[j:, q] L[j, q]`` of the columns ``before`` it."""
+    j = len(before)
+    for q, previous in enumerate(before):
+        column = column - previous[j - q :] * previous[j - q]
     return column
 
 
 @stage
-def _inverse_pivot(pivot: Array, threshold: Array) -> Array:
+def _inverse_pivot(column: Array, lower: Array, tolerance: Array, floor: Array) -> Array:
     # A dependent row gets a zero, which solves consistent singular systems and touches nothing else.
-    positive = pivot > threshold
+    pivot = column[0]
+    positive = pivot > jnp.maximum(lower[0] * tolerance, floor)
     return jnp.where(
         positive, lax.rsqrt(jnp.where(positive, pivot, jnp.ones_like(pivot))), jnp.zeros_like(pivot)
     )
 
 
 @stage
-def _floor(diagonal: list[Array], factor: Array) -> Array:
-    largest = diagonal[0]
-    for d in diagonal[1:]:
-        largest = jnp.maximum(largest, d)
-    return factor * largest
+def _floor(M: tuple[Array, ...], factor: Array) -> Array:
+    return factor * reduce(jnp.maximum, [column[0] for column in M])
 
 
 @stage
@@ -68,15 +69,13 @@ def cholesky(M: tuple[Array, ...], tolerance: float) -> Cholesky:
     ``(2 tolerance)^2`` times the largest one (a row of B that is rounding as a whole).
     """
     dtype = M[0].dtype
-    floor = _floor([column[0] for column in M], jnp.asarray(4 * tolerance * tolerance, dtype))
+    share = jnp.asarray(tolerance, dtype)
+    floor = _floor(M, jnp.asarray(4 * tolerance * tolerance, dtype))
     columns: list[Array] = []
     inverse: list[Array] = []
-    for j, lower in enumerate(M):
-        previous = [(columns[q][j - q :], columns[q][j - q]) for q in range(j)]
-        column = _schur_column(lower, previous) if previous else lower
-        inverse.append(
-            _inverse_pivot(column[0], jnp.maximum(lower[0] * jnp.asarray(tolerance, dtype), floor))
-        )
+    for lower in M:
+        column = _schur_column(lower, columns) if columns else lower
+        inverse.append(_inverse_pivot(column, lower, share, floor))
         columns.append(_scaled(column, inverse[-1]))
     return Cholesky(tuple(columns), tuple(inverse))
 

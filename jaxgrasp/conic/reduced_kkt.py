@@ -124,11 +124,14 @@ def kkt_solve(
     def respond(rhs: KKTVector) -> KKTVector:
         return _unscaled(program, frame, triangle, factored.solve(_scaled(frame, triangle, rhs)))
 
-    x = change = respond(rhs)
-    for _ in range(REFINEMENTS):
-        change = respond(_residual(kkt, frame, change, x, rhs))
+    def refine(_: Array, carry: tuple[KKTVector, KKTVector]) -> tuple[KKTVector, KKTVector]:
+        x, left = carry
+        change = respond(left)
         x = _sum(x, change)
-    return x
+        return x, _residual(kkt, frame, change, x, rhs)
+
+    nothing = jax.tree.map(jnp.zeros_like, rhs)
+    return lax.fori_loop(0, 1 + REFINEMENTS, refine, (nothing, rhs))[0]
 
 
 # Stages of the solve, which nothing differentiates.

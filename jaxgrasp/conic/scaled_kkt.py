@@ -16,6 +16,7 @@ squares by the QR factorisation).
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -152,14 +153,20 @@ def _diagonal(rates: Array, rhs: Array) -> Array:
     return jnp.concatenate(rows)
 
 
+def _largest(x: Array) -> Array:
+    """The largest entry of each lane (L,), by halves: XLA turns a long ``jnp.max`` into windows, which a kernel cannot
+    hold."""
+    rows = x.reshape(-1, x.shape[-1])
+    while rows.shape[0] > 1:
+        half = (rows.shape[0] + 1) // 2
+        rows = jnp.maximum(rows[:half], rows[-half:])
+    return rows[0]
+
+
 @stage
 def _rounding_floors(columns: Cone) -> Array:
     """Rows of S no longer than this are rounding as a whole."""
-    largest = None
-    for c in columns:
-        size = jnp.max(jnp.max(jnp.abs(c), axis=0), axis=0)
-        largest = size if largest is None else jnp.maximum(largest, size)
-    assert largest is not None
+    largest = reduce(jnp.maximum, [_largest(jnp.abs(c)) for c in columns])
     return jnp.asarray(4 * unit_roundoff(largest.dtype), largest.dtype) * largest
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from ..backend import stage, to_lanes
-from ..conic import Cone, cone_all, cone_any, cone_max, cone_sum
+from ..conic import Cone, cone_all, cone_any, cone_max, cone_sum, inner
 from ..core import Array, cross_components, frame_components, normalize_components
 from .grasp import Grasp
 from .models import Component
@@ -44,33 +45,37 @@ class Folded(NamedTuple):
     resultant: Array
 
 
+def _coordinates(points: Array) -> tuple[Array, ...]:
+    """(k, dim, L) to dim arrays (k, L)."""
+    return tuple(points[:, i] for i in range(points.shape[1]))
+
+
 @stage
 def _valid_and_live(
-    position: tuple[Array, ...], normal: tuple[Array, ...], friction: Array, torsion: Array, active: Array
+    position: Array, normal: Array, friction: Array, torsion: Array, active: Array
 ) -> tuple[Array, Array]:
-    """Which lanes are grasps, and which of their contacts count; coordinates and coefficients (k, L)."""
-    sound = sound_contacts(position, normal, friction, torsion) | ~active
+    """Which lanes are grasps (L,), and which of their contacts count (k, L)."""
+    sound = sound_contacts(_coordinates(position), _coordinates(normal), friction, torsion) | ~active
     valid = cone_all(sound) & cone_any(active)
     return valid, active & valid
 
 
 @stage
-def _length(position: tuple[Array, ...]) -> Array:
-    square = position[0] * position[0]
-    for x in position[1:]:
-        square = square + x * x
-    largest = jnp.sqrt(cone_max(square))
+def _length(position: Array) -> Array:
+    x = _coordinates(position)
+    largest = jnp.sqrt(cone_max(inner(x, x)))
     return jnp.where(largest > 0, largest, jnp.ones_like(largest))
 
 
 @stage
-def _unit(normal: tuple[Array, ...]) -> tuple[Array, ...]:
-    return normalize_components(normal)
+def _unit(normal: Array) -> tuple[Array, ...]:
+    return normalize_components(_coordinates(normal))
 
 
 @stage
-def _column(point: tuple[Array, ...], direction: tuple[Array, ...], factor: Array) -> Array:
-    return jnp.stack([factor * x for x in (*direction, *cross_components(point, direction))])
+def _column(point: Array, direction: tuple[Array, ...], factor: Array) -> Array:
+    moment = cross_components(_coordinates(point), direction)
+    return jnp.stack([factor * x for x in (*direction, *moment)])
 
 
 @stage
@@ -101,14 +106,13 @@ def fold(contacts: Contacts, components: tuple[Component, ...], length: Array | 
     """
     position, normal, friction, torsion, active = (to_lanes(x) for x in contacts)
     dtype, dimension = position.dtype, position.shape[1]
-    coordinates = tuple(tuple(x[:, i] for i in range(dimension)) for x in (position, normal))
-    valid, live = _valid_and_live(*coordinates, friction, torsion, active)
+    valid, live = _valid_and_live(position, normal, friction, torsion, active)
     exists = live.astype(dtype)
-    point = tuple(jnp.where(live, position[:, i], jnp.zeros_like(position[:, i])) for i in range(dimension))
+    point = jnp.where(live[:, None], position, jnp.zeros_like(position))
     length = _length(point) if length is None else length
-    point = tuple(x / length for x in point)
-    last = [jnp.zeros((), dtype)] * (dimension - 1) + [jnp.ones((), dtype)]
-    direction = _unit(tuple(jnp.where(live, normal[:, i], last[i]) for i in range(dimension)))
+    point = point / length
+    last = np.eye(dimension, dtype=dtype)[-1:, :, None]
+    direction = _unit(jnp.where(live[:, None], normal, last))
     frames = frame_components(direction)
 
     mu = jnp.where(live, friction, jnp.zeros_like(friction))

@@ -148,17 +148,23 @@ def _quadratic_bound(program: ConvexConeProgram, dual: DualPoint, u: Cone) -> Ar
     return dual.gain + cone_sum(exists * (flat * best * best / 2 - rho * best - spent / 2))
 
 
+class BarrierPrices(NamedTuple):
+    """Where the dual function of the fixed barriers is taken: z_0 and p (k, L), and what the caps cost (L,)."""
+
+    head: Array
+    price: Array
+    paid: Array
+
+
 @stage
-def _barrier_bound(program: ConvexConeProgram, dual: DualPoint, u: Cone) -> Array:
-    """Dual value of the fixed barriers: ``sum phi - phi log phi + phi/2 log det z + psi - psi log psi + psi log p``.
+def _barrier_prices(program: ConvexConeProgram, x: Cone, u: Cone) -> BarrierPrices:
+    """The prices that make the bound high.
 
     Where u_0 is at its level, ``phi z_0 / det z = psi / p = level`` fixes z_0 and p; elsewhere p is that of the forces.
     The level's multipliers, of sum 1, supply what z lacks, the dearest caps first; what is left is
     worth most at the largest u_0.
     """
-    exists, x = program.exists, dual.x
-    phi, psi = program.cone_floor, program.head_floor
-    assert phi is not None and psi is not None
+    exists, phi, psi = program.exists, program.cone_floor, program.head_floor
     zero, one = jnp.zeros_like(exists), jnp.ones_like(exists)
     top = _top(exists, u)
     level, leads = top + zero, exists * jnp.where(u[0] >= top, one, zero)
@@ -178,11 +184,29 @@ def _barrier_bound(program: ConvexConeProgram, dual: DualPoint, u: Cone) -> Arra
     head = share + leads * spare + over + x[0]
     # A contact without barrier only needs z in its cone.
     price = jnp.where(phi > 0, price, exists * (head - tail))
-    head = head - price
-    z = (jnp.where(exists > 0, head, one), *(exists * v for v in x[1:]))
-    det = jnp.where(interior_distance(z) > 0, determinant(z), zero)
-    value = _conjugate(phi, det, 0.5) + _conjugate(psi, price, 1.0)
-    return dual.gain - paid + cone_sum(jnp.where(exists > 0, value, zero))
+    return BarrierPrices(head - price, price, paid)
+
+
+@stage
+def _conjugates(program: ConvexConeProgram, x: Cone, prices: BarrierPrices) -> Array:
+    """``phi - phi log phi + phi/2 log det z + psi - psi log psi + psi log p`` (k, L)."""
+    exists, one = program.exists, jnp.ones_like(program.exists)
+    z = (jnp.where(exists > 0, prices.head, one), *(exists * v for v in x[1:]))
+    det = jnp.where(interior_distance(z) > 0, determinant(z), 0 * one)
+    value = _conjugate(program.cone_floor, det, 0.5) + _conjugate(program.head_floor, prices.price, 1.0)
+    return jnp.where(exists > 0, value, 0 * one)
+
+
+@stage
+def _with_conjugates(gain: Array, paid: Array, value: Array) -> Array:
+    return gain - paid + cone_sum(value)
+
+
+def _barrier_bound(program: ConvexConeProgram, dual: DualPoint, u: Cone) -> Array:
+    """Dual value of the fixed barriers."""
+    # One stage would recompute the logarithms so often that the CPU backend splits it over threads; a kernel may not.
+    prices = _barrier_prices(program, dual.x, u)
+    return _with_conjugates(dual.gain, prices.paid, _conjugates(program, dual.x, prices))
 
 
 def _conjugate(floor: Array, value: Array, power: float) -> Array:
