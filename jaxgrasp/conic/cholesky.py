@@ -13,6 +13,7 @@ from jax import lax
 
 from ..backend import stage
 from ..core import Array
+from .cone import entries
 
 __all__ = [
     "Cholesky",
@@ -38,7 +39,7 @@ def _schur_column(column: Array, before: list[Array]) -> Array:
     """``M[j:, j] - sum_q L[j:, q] L[j, q]`` of the columns ``before`` it."""
     j = len(before)
     for q, previous in enumerate(before):
-        column = column - previous[j - q :] * previous[j - q]
+        column = column - previous[j - q :] * previous[j - q : j - q + 1]
     return column
 
 
@@ -84,9 +85,9 @@ def _back_substituted(factor: Cholesky, x: list[Array]) -> Array:
     columns, inverse = factor
     for i in reversed(range(len(x))):
         for q in range(i + 1, len(x)):
-            x[i] = x[i] - columns[i][q - i] * x[q]
+            x[i] = x[i] - columns[i][q - i : q - i + 1] * x[q]
         x[i] = x[i] * inverse[i]
-    return jnp.stack(x)
+    return jnp.concatenate(x)
 
 
 @stage
@@ -99,16 +100,16 @@ def cholesky_solve(factor: Cholesky, rhs: Array) -> Array:
 @stage
 def solve_transposed(factor: Cholesky, rhs: Array) -> Array:
     """``L^-T rhs`` (m, L); zero where the pivot was rounding."""
-    return _back_substituted(factor, list(rhs))
+    return _back_substituted(factor, entries(rhs))
 
 
 def _forward_substituted(factor: Cholesky, rhs: Array) -> tuple[list[Array], list[Array]]:
     """x with ``L x = rhs``, and what each row has to give before it is divided by its pivot."""
     columns, inverse = factor
-    x, left = list(rhs), []
+    x, left = entries(rhs), []
     for i in range(len(x)):
         for q in range(i):
-            x[i] = x[i] - columns[q][i - q] * x[q]
+            x[i] = x[i] - columns[q][i - q : i - q + 1] * x[q]
         left.append(x[i])
         x[i] = x[i] * inverse[i]
     return x, left
@@ -117,14 +118,14 @@ def _forward_substituted(factor: Cholesky, rhs: Array) -> tuple[list[Array], lis
 @stage
 def solve_lower(factor: Cholesky, rhs: Array) -> Array:
     """x with ``L x = rhs`` (m, .., L); 0 in the rows whose pivot was rounding."""
-    return jnp.stack(_forward_substituted(factor, rhs)[0])
+    return jnp.concatenate(_forward_substituted(factor, rhs)[0])
 
 
 @stage
 def residual_lower(factor: Cholesky, rhs: Array) -> Array:
     """``rhs - L x`` of ``solve_lower``: what the rows whose pivot was rounding leave."""
     _, left = _forward_substituted(factor, rhs)
-    return jnp.stack(
+    return jnp.concatenate(
         [jnp.where(p > 0, jnp.zeros_like(r), r) for p, r in zip(factor.inverse, left, strict=True)]
     )
 
@@ -133,13 +134,13 @@ def residual_lower(factor: Cholesky, rhs: Array) -> Array:
 def null_combination(factor: Cholesky, dependent: Array) -> Array:
     """v with ``v^T A = 0`` for A = L Q and ``v_i = dependent_i`` in the rows that depend on those above them."""
     columns, inverse = factor
-    v = list(dependent)
+    v = entries(dependent)
     for i in reversed(range(len(v))):
         total = jnp.zeros_like(v[i])
         for q in range(i + 1, len(v)):
-            total = total - columns[i][q - i] * v[q]
+            total = total - columns[i][q - i : q - i + 1] * v[q]
         v[i] = jnp.where(inverse[i] > 0, total * inverse[i], v[i])
-    return jnp.stack(v)
+    return jnp.concatenate(v)
 
 
 @stage
@@ -147,18 +148,18 @@ def inverse_frobenius(factor: Cholesky) -> Array:
     """``|L^-1|_F^2 = trace(M^-1)``, an upper bound of 1 / lambda_min(M); infinite where a pivot was dropped."""
     columns, inverse = factor
     m = len(inverse)
-    total = jnp.zeros_like(inverse[0])
+    total = jnp.zeros_like(inverse[0])[None]
     full = inverse[0] > 0
     for j in range(m):
         x: dict[int, Array] = {}
         for i in range(j, m):
             if i == j:
-                x[i] = inverse[i]
+                x[i] = inverse[i][None]
             else:
-                entry = -columns[j][i - j] * x[j]
+                entry = -columns[j][i - j : i - j + 1] * x[j]
                 for q in range(j + 1, i):
-                    entry = entry - columns[q][i - q] * x[q]
+                    entry = entry - columns[q][i - q : i - q + 1] * x[q]
                 x[i] = entry * inverse[i]
             total = total + x[i] * x[i]
         full = full & (inverse[j] > 0)
-    return jnp.where(full, total, jnp.full_like(total, jnp.inf))
+    return jnp.where(full, total[0], jnp.full_like(total[0], jnp.inf))

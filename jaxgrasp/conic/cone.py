@@ -7,6 +7,7 @@ the cone, and of the friction LMIs (11.4), (11.35) up to a factor.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import reduce
 
 import jax.numpy as jnp
@@ -21,6 +22,7 @@ __all__ = [
     "cone_min",
     "cone_sum",
     "determinant",
+    "entries",
     "inner",
     "interior_distance",
     "jordan_product",
@@ -32,33 +34,46 @@ Cone = tuple[Array, ...]
 
 
 def _total(terms: list[Array]) -> Array:
-    # An explicit sum: a reduction would keep the compiler from vectorising over lanes.
     return reduce(jnp.add, terms)
+
+
+def entries(x: Array) -> list[Array]:
+    """The entries of the first axis, each (1, ..).
+
+    They keep the axis, because XLA moves a reshape behind one operation in each round of its simplifications: a chain
+    of operations on ``x[i]`` takes it as many rounds as it is long.
+    """
+    return [x[i : i + 1] for i in range(x.shape[0])]
+
+
+def _over_cones(combine: Callable[[Array, Array], Array], x: Array) -> Array:
+    # Written out: a reduction would keep the compiler from vectorising over lanes.
+    return reduce(combine, entries(x))[0]
 
 
 def cone_sum(x: Array) -> Array:
     """Sum over the k cones: (k, ..) to (..)."""
-    return _total([x[i] for i in range(x.shape[0])])
+    return _over_cones(jnp.add, x)
 
 
 def cone_max(x: Array) -> Array:
     """Maximum over the k cones."""
-    return reduce(jnp.maximum, [x[i] for i in range(x.shape[0])])
+    return _over_cones(jnp.maximum, x)
 
 
 def cone_min(x: Array) -> Array:
     """Minimum over the k cones."""
-    return reduce(jnp.minimum, [x[i] for i in range(x.shape[0])])
+    return _over_cones(jnp.minimum, x)
 
 
 def cone_all(x: Array) -> Array:
     """Whether x holds in all cones."""
-    return reduce(jnp.logical_and, [x[i] for i in range(x.shape[0])])
+    return _over_cones(jnp.logical_and, x)
 
 
 def cone_any(x: Array) -> Array:
     """Whether x holds in some cone."""
-    return reduce(jnp.logical_or, [x[i] for i in range(x.shape[0])])
+    return _over_cones(jnp.logical_or, x)
 
 
 def inner(x: Cone, y: Cone) -> Array:

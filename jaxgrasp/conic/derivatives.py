@@ -27,6 +27,7 @@ from ..core import Array
 from .cone import Cone, cone_min, cone_sum, inner
 from .convex_cone_program import Bounds, ConvexConeProgram, ConvexPoint, OptionalArray, map_bounds
 from .jordan_frame import smooth_determinant, tail_size
+from .products import vector_inner
 from .reduced_kkt import KKTVector, ReducedKKT, central_products, kkt_product, reduced_kkt
 
 __all__ = ["PointShift", "Residuals", "centring", "lagrangian", "point_tangent", "residuals"]
@@ -66,8 +67,7 @@ def lagrangian(program: ConvexConeProgram, point: ConvexPoint) -> Array:
         total = total + cone_sum(exists * inner(u, program.curvature.apply(u))) / 2
     if program.level is not None:
         total = total + program.level * point.xi
-    for i in range(program.rhs.shape[0]):
-        total = total + point.y[i] * (applied[i] - program.rhs[i])
+    total = total + vector_inner(point.y, applied - program.rhs)
     if program.cap is not None:
         mask = program.masks().cap
         limit = jnp.where(mask > 0, program.cap, jnp.zeros_like(program.cap))

@@ -12,7 +12,8 @@ import numpy as np
 from ..backend import stage
 from ..core import Array
 from .cholesky import Cholesky
-from .cone import Cone, cone_sum
+from .cone import Cone, cone_sum, entries
+from .products import matvec
 
 __all__ = ["orthonormal_rows"]
 
@@ -33,8 +34,8 @@ def _overlaps(rows: list[Array], rest: Array) -> Array:
 def _reorthogonalized(rows: list[Array], rest: Array, overlaps: Array) -> Array:
     """``r - sum_q <q, r> q``."""
     remainder = rest[0]
-    for i, row in enumerate(rows):
-        remainder = remainder - overlaps[i] * row
+    for overlap, row in zip(entries(overlaps), rows, strict=True):
+        remainder = remainder - overlap * row
     return remainder
 
 
@@ -55,10 +56,7 @@ def _row(remainder: Array, reciprocal: Array) -> Array:
 @stage
 def _products_below(rest: Array, row: Array) -> Array:
     """``<r, row>`` of the remainders below (m - 1 - i, L)."""
-    total = rest[1:, 0] * row[0]
-    for i in range(1, row.shape[0]):
-        total = total + rest[1:, i] * row[i]
-    return total
+    return matvec((rest[1:],), (row,))
 
 
 @stage

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from ..backend import stage
 from ..core import Array, Status, first_of
-from .cone import cone_sum, determinant, inner
+from .cone import cone_all, cone_sum, determinant, inner
 from .linear_cone_program import LinearConeProgram
 from .linear_newton_step import LinearPoint, LinearStep, linear_newton_step
 from .stopping import StallRule, first_code, iterate_until_stopped
@@ -52,9 +52,7 @@ def _gap(exists: Array, point: LinearPoint) -> tuple[Array, Array]:
     gap = cone_sum(exists * inner(point.u, point.z))
     inside = jnp.isfinite(gap)
     for x in (point.u, point.z):
-        d = determinant(x)
-        for i in range(d.shape[0]):
-            inside = inside & (d[i] > 0)
+        inside = inside & cone_all(determinant(x) > 0)
     return gap, inside
 
 

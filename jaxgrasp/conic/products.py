@@ -6,11 +6,13 @@ arrays (m, k, L), one for each component of the cones its columns belong to.
 
 from __future__ import annotations
 
+from functools import reduce
+
 import jax.numpy as jnp
 
 from ..backend import stage
 from ..core import Array
-from .cone import Cone
+from .cone import Cone, cone_sum, entries
 
 __all__ = ["gram", "matvec", "rmatvec", "vector_inner", "vector_norm"]
 
@@ -22,32 +24,25 @@ def vector_norm(v: Array) -> Array:
 
 def vector_inner(v: Array, w: Array) -> Array:
     """``<v, w>`` (L,)."""
-    total = v[0] * w[0]
-    for i in range(1, v.shape[0]):
-        total = total + v[i] * w[i]
-    return total
+    return cone_sum(v * w)
 
 
 def matvec(columns: Cone, x: Cone) -> Array:
     """``B x`` (m, L)."""
-    total = None
-    for c, part in zip(columns, x, strict=True):
-        for i in range(part.shape[0]):
-            term = c[:, i] * part[i]
-            total = term if total is None else total + term
-    assert total is not None
-    return total
+    terms = [
+        c[:, i : i + 1] * entry
+        for c, part in zip(columns, x, strict=True)
+        for i, entry in enumerate(entries(part))
+    ]
+    return reduce(jnp.add, terms)[:, 0]
 
 
 def rmatvec(columns: Cone, y: Array) -> Cone:
     """``B^T y``, d arrays (k, L)."""
-    parts = []
-    for c in columns:
-        total = c[0] * y[0]
-        for i in range(1, y.shape[0]):
-            total = total + c[i] * y[i]
-        parts.append(total)
-    return tuple(parts)
+    factors = entries(y[:, None])
+    return tuple(
+        reduce(jnp.add, [row * f for row, f in zip(entries(c), factors, strict=True)])[0] for c in columns
+    )
 
 
 def gram(columns: Cone) -> tuple[Array, ...]:
@@ -59,12 +54,7 @@ def gram(columns: Cone) -> tuple[Array, ...]:
 def _gram_column(columns: Cone, j: int) -> Array:
     @stage
     def products(columns: Cone) -> Array:
-        total = None
-        for c in columns:
-            for i in range(c.shape[1]):
-                term = c[j:, i] * c[j, i]
-                total = term if total is None else total + term
-        assert total is not None
-        return total
+        terms = [c[j:, i : i + 1] * c[j : j + 1, i : i + 1] for c in columns for i in range(c.shape[1])]
+        return reduce(jnp.add, terms)[:, 0]
 
     return products(columns)

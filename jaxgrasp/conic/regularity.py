@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from ..backend import stage
 from ..core import Array, complementary_ratio, largest_response
-from .cone import Cone, cone_max
+from .cone import Cone, cone_all, cone_max, cone_sum
 from .convex_cone_program import Bounds, ConvexConeProgram, ConvexPoint
 from .jordan_frame import JordanFrame
 from .products import vector_norm
@@ -41,9 +41,7 @@ def _effective(program: ConvexConeProgram) -> Cone:
     """Ones where a component of u has any effect; a contact without friction has tails that have none."""
     out = []
     for j, c in enumerate(program.columns):
-        effect = jnp.zeros_like(program.exists)
-        for i in range(c.shape[0]):
-            effect = effect + jnp.abs(c[i])
+        effect = cone_sum(jnp.abs(c))
         if program.curvature is not None:
             effect = effect + jnp.abs(
                 program.curvature.apply(tuple(program.exists for _ in program.columns))[j]
@@ -87,8 +85,7 @@ def _strict_and_unique(
     def separated(a: Array, b: Array, exists: Array) -> None:
         nonlocal strict
         apart = (a > ratio * b) | (b > ratio * a) | (exists == 0)
-        for i in range(apart.shape[0]):
-            strict = strict & apart[i]
+        strict = strict & cone_all(apart)
 
     if program.cone_floor is None:
         for h in kkt.stiffness[:2]:  # eigenvalues of z over those of u

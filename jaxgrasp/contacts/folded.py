@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from ..backend import stage, to_lanes
-from ..conic import Cone, cone_all, cone_any, cone_max, cone_sum, inner
+from ..conic import Cone, cone_all, cone_any, cone_max, cone_sum, entries, inner
 from ..core import Array, cross_components, frame_components, normalize_components
 from .grasp import Grasp
 from .models import Component
@@ -90,13 +91,8 @@ def resultant(normal_column: Array) -> Array:
 
 @stage
 def _frobenius(columns: Cone) -> Array:
-    total = None
-    for c in columns:
-        for i in range(c.shape[0]):
-            part = cone_sum(c[i] * c[i])
-            total = part if total is None else total + part
-    assert total is not None
-    return jnp.sqrt(total)
+    rows = [entries((row * row).swapaxes(0, 1)) for c in columns for row in entries(c)]
+    return jnp.sqrt(reduce(jnp.add, [reduce(jnp.add, squares) for squares in rows])[0, 0])
 
 
 def fold(contacts: Contacts, components: tuple[Component, ...], length: Array | None = None) -> Folded:

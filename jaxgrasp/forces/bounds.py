@@ -18,6 +18,7 @@ from ..conic import (
     cone_max,
     cone_sum,
     determinant,
+    entries,
     inner,
     interior_distance,
     rmatvec,
@@ -84,31 +85,29 @@ class DualPoint(NamedTuple):
 @stage
 def _dual_point(program: ConvexConeProgram, rows: Array) -> DualPoint:
     m = program.rhs.shape[0]
-    gain = -vector_inner(program.rhs, rows)
+    gain = -vector_inner(program.rhs, rows[:m])
     if program.bound is not None:
-        for j in range(program.bound.shape[0]):
-            gain = gain - jnp.abs(rows[m + j]) * program.bound[j]
+        gain = gain - cone_sum(jnp.abs(rows[m:]) * program.bound)
     return DualPoint(rmatvec(program.columns, rows), gain)
 
 
 def _level_multipliers(violation: Array, cap: Array | None, total: Array) -> Array:
     """Multipliers of the level, of sum ``total``, that cover most of ``violation`` (k, L): the dearest caps first."""
-    k = violation.shape[0]
+    wanted, zero = entries(violation), jnp.zeros_like(total)[None]
+    caps = None if cap is None else entries(cap)
     rows = []
-    for i in range(k):
-        before = jnp.zeros_like(total)
-        for j in range(k):
+    for i, most in enumerate(wanted):
+        before = zero
+        for j, other in enumerate(wanted):
             if j == i:
                 continue
-            if cap is None:
-                first = j < i
-                before = before + (violation[j] if first else jnp.zeros_like(total))
+            if caps is None:
+                before = before + (other if j < i else zero)
             else:
-                first = (cap[j] > cap[i]) | ((cap[j] == cap[i]) & (j < i))
-                before = before + jnp.where(first, violation[j], jnp.zeros_like(total))
-        remaining = jnp.maximum(total - before, jnp.zeros_like(total))
-        rows.append(jnp.minimum(remaining, violation[i]))
-    return jnp.stack(rows)
+                first = (caps[j] > caps[i]) | ((caps[j] == caps[i]) & (j < i))
+                before = before + jnp.where(first, other, zero)
+        rows.append(jnp.minimum(jnp.maximum(total - before, zero), most))
+    return jnp.concatenate(rows)
 
 
 @stage

@@ -34,9 +34,8 @@ def separation(program: ConvexConeProgram, rows: Array, limit: float) -> Array:
         most = jnp.minimum(most, program.cap)
     taken = cone_sum(violation * most)
     if program.bound is not None:
-        for j in range(program.bound.shape[0]):
-            taken = taken + jnp.abs(rows[m + j]) * program.bound[j]
-    power = -vector_inner(program.rhs, rows)
+        taken = taken + cone_sum(jnp.abs(rows[m:]) * program.bound)
+    power = -vector_inner(program.rhs, rows[:m])
     worth = power > 0
     return jnp.where(worth, 1 - taken / jnp.where(worth, power, jnp.ones_like(power)), -jnp.ones_like(power))
 
@@ -67,7 +66,6 @@ def proven_separation(
         most = jnp.minimum(most, program.cap * load.size)
     taken = cone_sum(violation * most)
     if beta is not None:
-        for j in range(beta.shape[0]):
-            taken = taken + jnp.abs(beta[j]) * program.bound[j] * load.size
+        taken = taken + cone_sum(jnp.abs(beta) * program.bound) * load.size
     power = vector_inner(twist, load.wrench)
     return power - rounding * vector_norm(twist) * outer - taken

@@ -20,6 +20,7 @@ from ..conic import (
     Cone,
     ConvexConeProgram,
     Curvature,
+    cone_all,
     null_combination,
     residual_lower,
     solve_lower,
@@ -92,11 +93,9 @@ class ForceProblem(NamedTuple):
 @stage
 def _scaled_wrench(force: Array, torque: Array, length: Array) -> tuple[Array, Array]:
     """(force; torque / L), and whether it is finite."""
-    rows = [force[i] for i in range(force.shape[0])] + [torque[i] / length for i in range(torque.shape[0])]
-    finite = jnp.isfinite(rows[0])
-    for x in rows[1:]:
-        finite = finite & jnp.isfinite(x)
-    return jnp.stack([jnp.where(finite, x, jnp.zeros_like(x)) for x in rows]), finite
+    rows = jnp.concatenate([force, torque / length])
+    finite = cone_all(jnp.isfinite(rows))
+    return jnp.where(finite, rows, jnp.zeros_like(rows)), finite
 
 
 @stage
@@ -132,13 +131,11 @@ def _limits(
     sound = jnp.ones_like(size) > 0
     if cap is not None:
         good = (cap > 0) | (exists == 0)  # NaN compares false
-        for i in range(cap.shape[0]):
-            sound = sound & good[i]
+        sound = sound & cone_all(good)
         cap = jnp.where(good & (exists > 0), cap / size, jnp.full_like(cap, jnp.inf))
     if torque is not None and norm is not None:
         good = (torque > 0) & jnp.isfinite(torque)
-        for j in range(torque.shape[0]):
-            sound = sound & good[j]
+        sound = sound & cone_all(good)
         torque = jnp.where(good, torque, jnp.ones_like(torque)) / (size * norm)
     return cap, torque, sound
 
@@ -168,7 +165,7 @@ def torque_rows(
             parts.append(rows)
         norm = jnp.sqrt(square) if row_norm is None else row_norm
         usable = jnp.isfinite(norm) & (norm > 0)
-        sound = reduce(jnp.logical_and, [jnp.isfinite(norm[j]) for j in range(norm.shape[0])])
+        sound = cone_all(jnp.isfinite(norm))
         norm = jnp.where(usable, norm, jnp.ones_like(norm))
         columns = tuple(
             jnp.stack([jnp.where(usable, x / norm, zero) for x in rows], axis=1) for rows in parts

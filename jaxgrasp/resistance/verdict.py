@@ -6,12 +6,13 @@ working dtype: what passes here passes there. Nothing is claimed that was not ce
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import NamedTuple
 
 import jax.numpy as jnp
 
 from ..backend import stage
-from ..conic import Cone, cone_min, cone_sum, inner, interior_distance, matvec, rmatvec, vector_norm
+from ..conic import Cone, cone_min, cone_sum, entries, inner, interior_distance, matvec, rmatvec, vector_norm
 from ..contacts import Folded, Tile, normalized, onto_null_space, smallest_slack, to_body, to_twist, unfold
 from ..core import Array, Status, first_of, rank_tolerance, rounding_constant, unit_roundoff
 from .problem import upper_bound
@@ -88,11 +89,7 @@ def _unit_twist(y: Array) -> Array:
 def _escape_depth(columns: Cone, exists: Array, xi: Array, rounding: Array) -> Array:
     """``min_i x_0,i - |x_1..,i| - c eps |A_i|`` with ``x = A^T xi``: positive proves that xi escapes."""
     x = rmatvec(columns, xi)
-    square = None
-    for c in columns:
-        for i in range(c.shape[0]):
-            square = c[i] * c[i] if square is None else square + c[i] * c[i]
-    assert square is not None
+    square = reduce(jnp.add, [row * row for c in columns for row in entries(c)])[0]
     depth = interior_distance(x) - rounding * jnp.sqrt(square)
     return cone_min(jnp.where(exists > 0, depth, jnp.full_like(depth, jnp.inf)))
 
