@@ -305,7 +305,7 @@ def test_an_escape_proves_at_any_size(size):
     """Evidence is a ray: what it proves does not depend on its length, and nothing overflows."""
     rng = np.random.default_rng(0)
     grasp = ring([3], "float64")
-    jacobian, torque = rng.normal(size=(12, 2)), np.full(2, 1e-4)
+    jacobian, torque = rng.normal(size=(12, 7)), np.full(7, 1e-4)
     asked = {"wrench": np.array([0.0, 0, -10, 0, 0, 0]), "criterion": jg.SmallestSum()}
     out = jg.optimize_forces(grasp, **asked, torque_limits=(jacobian, torque))
     assert (out.status == Status.INFEASIBLE).all()

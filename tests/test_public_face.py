@@ -253,8 +253,6 @@ def test_statuses_are_int32_and_brackets_are_in_order(dtype):
     wrench, one = np.array([0.3, -1.0, 0.01], dtype), np.eye(2, dtype=dtype)
     body = jg.RigidBody(np.asarray(0.2, dtype), np.asarray(1e-4, dtype))
     limits = jnp.asarray(one), jnp.asarray(one[None])
-    ends, lift = np.array([[-1, 0, 0], [1, 0, 0]], dtype), np.array([0, 0, -10, 0, 0, 0], dtype)
-    pinch = jg.Grasp(ends, -ends, jg.HardFinger(np.asarray(0.5, dtype)))
     answers = [
         jg.wrench_resistance(grasp),
         jg.optimize_forces(grasp, wrench),
@@ -263,7 +261,7 @@ def test_statuses_are_int32_and_brackets_are_in_order(dtype):
         lmi.lmi_feasibility(*limits),
         lmi.lmi_minimize(lmi.LMIProblem(jnp.ones(1, dtype), *limits, jnp.ones(1, dtype))),
         lmi.sdp_minimize(jnp.ones(1, dtype), *limits),
-        lmi.lmi_forces(pinch, lift, criterion=jg.SmallestSum()),
+        lmi.lmi_forces(grasp, wrench, criterion=jg.SmallestSum()),
     ]
     for answer in answers:
         name = type(answer).__name__

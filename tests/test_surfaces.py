@@ -347,11 +347,7 @@ def test_exact_at_metre_scale(name, mug, block):
     mesh = objects.make_object(name)
     mesh.apply_scale(10)
     mesh.apply_translation((10.0, -7.0, 3.0))
-    surface = (
-        surfaces.MeshSurface(mesh, resolution=16)
-        if name == "box"
-        else surfaces.MeshSurface(mesh, resolution=64)
-    )
+    surface = surfaces.MeshSurface(mesh, resolution=16 if name == "box" else 32)
     random = np.random.default_rng(0)
     on, _ = surface.sample(0, 40)
     point = np.concatenate(
