@@ -83,23 +83,23 @@ def pytest_collection_modifyitems(config, items):
 
 # Tracing makes so many objects that a third of its time is a search for garbage; files are searched between instead.
 gc.disable()
-RESIDENT_BYTES = 2_000_000_000
+RESIDENT_SHARE = 1 / 6  # of the machine's memory, for each worker
 
 
-def resident() -> float:
-    """Bytes of memory that this process holds; inf where the system does not say."""
+def is_large() -> bool:
+    """Whether this process holds more than its share of the memory; True where the system does not say."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
-    except OSError:
-        return float("inf")
-    return pages * os.sysconf("SC_PAGE_SIZE")
+        return pages > RESIDENT_SHARE * os.sysconf("SC_PHYS_PAGES")
+    except (OSError, ValueError):
+        return True
 
 
 @pytest.fixture(autouse=True, scope="module")
 def bounded_memory():
     """A compiled program keeps about 100 MB: after a file, all are dropped if there are many; the store has them."""
     yield
-    if resident() < RESIDENT_BYTES:
+    if not is_large():
         return
     jax.clear_caches()
     gc.collect()
