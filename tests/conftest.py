@@ -15,19 +15,18 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from compiling import LEVEL_FLAG, quick_flags
 
 ROOT = Path(__file__).resolve().parents[1]
 STORE = ROOT / ".jax_test_cache"
 STORE_BYTES = 500_000_000  # a cold run leaves about 60 MB; what was longest unread goes first
-LEVEL_FLAG = "--xla_backend_optimization_level"
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 if LEVEL_FLAG not in os.environ.get("XLA_FLAGS", ""):
     level = os.environ.get("JAXGRASP_TEST_OPTIMIZATION", "0")
     if level not in ("0", "1", "2", "3"):
         raise pytest.UsageError(f"JAXGRASP_TEST_OPTIMIZATION must be 0, 1, 2 or 3, not {level!r}")
-    quick = [f"{LEVEL_FLAG}={level}"] + ["--xla_llvm_disable_expensive_passes=true"] * (level == "0")
-    os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *quick]).strip()
+    os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *quick_flags(level)]).strip()
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(STORE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import USERS_OPTIONS
 from grasps import ball
 from shapes import PLANAR
 from smooth_problems import as_arrays, direction, grasp_of, planar_problem
@@ -20,8 +21,7 @@ TOLERANCE = 1e-11
 
 def at_users_level(function, *arguments):
     """What ``function`` gives, compiled as users compile it."""
-    options = {"xla_backend_optimization_level": 3, "xla_llvm_disable_expensive_passes": False}
-    return jax.jit(function).lower(*arguments).compile(options)(*arguments)
+    return jax.jit(function).lower(*arguments).compile(USERS_OPTIONS)(*arguments)
 
 
 @pytest.fixture(scope="module")
