@@ -54,7 +54,6 @@ def gram(columns: Cone) -> tuple[Array, ...]:
 def _gram_column(columns: Cone, j: int) -> Array:
     @stage
     def products(columns: Cone) -> Array:
-        terms = [c[j:, i : i + 1] * c[j : j + 1, i : i + 1] for c in columns for i in range(c.shape[1])]
-        return reduce(jnp.add, terms)[:, 0]
+        return matvec(tuple(c[j:] for c in columns), tuple(c[j] for c in columns))
 
     return products(columns)
