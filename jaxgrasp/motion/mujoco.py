@@ -209,7 +209,8 @@ class MujocoPlant(eqx.Module):
             after = self._step(model, state, nominal)
             return jax.jacfwd(changed, argnums=(0, 1))(jnp.zeros(12, force.dtype), force)
 
-        return self._over_batch(one, state, grasp, force)
+        # One grasp after another: MJX's independent batched LAPACK calls wait for each other for ever on few cores.
+        return self._over_batch(jax.custom_batching.sequential_vmap(one), state, grasp, force)
 
 
 BATCHED = ("body_mass", "body_subtreemass", "body_inertia", "body_iquat")
