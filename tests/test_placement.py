@@ -172,11 +172,11 @@ def test_any_measure_climbs(measure, gains):
         grasp = jg.Grasp(out.end, surface.normal(out.end), jg.HardFinger(0.5))
         return np.median(np.asarray(measure(grasp)))
 
-    # Where the margin is largest the internal force has a kink, and so has the radius: it ends no lower.
+    # Where the margin is largest the internal force has a kink, and so has the radius: both end there, to rounding.
     if gains:
         assert median(climbed) > median(margin)
     else:
-        assert median(climbed) >= median(margin) > 0
+        assert median(climbed) >= (1 - 1e-9) * median(margin) > 0
 
 
 @pytest.mark.slow("test_three_fingers_climb_to_the_equator_of_a_ball")
