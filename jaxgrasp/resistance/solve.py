@@ -78,6 +78,8 @@ class WrenchResistance(Answer):
                     and the proof of RESISTANT; zero where the margin is -inf, NaN where INVALID
     escape_twist    (*batch, m) (velocity; angular velocity), unit norm: the proof of NOT_RESISTANT; zero
                     where RESISTANT
+    bound_twist     (*batch, m) (velocity; angular velocity), unit norm: the proof of ``upper``, by the largest multiple
+                    of it that the dual admits; no derivative
     iterations      int32 interior-point iterations spent
     stop            int32, a ``Status``: why the iteration ended
     """
@@ -88,6 +90,7 @@ class WrenchResistance(Answer):
     rank: Int[Array, "*batch"]
     internal_force: Float[Array, "*batch kn"]
     escape_twist: Float[Array, "*batch m"]
+    bound_twist: Float[Array, "*batch m"]
     iterations: Int[Array, "*batch"]
     stop: Int[Array, "*batch"]
 
@@ -294,6 +297,7 @@ def _answer(solved: Solved) -> WrenchResistance:
         rank,
         found.internal_force,
         found.escape_twist,
+        found.bound_twist,
         solved.iterations,
         solved.stop,
     )

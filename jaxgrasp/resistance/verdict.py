@@ -37,6 +37,7 @@ class Verdict(NamedTuple):
     rank: Array
     internal_force: Array  # (k n, L)
     escape_twist: Array  # (m, L)
+    bound_twist: Array  # (m, L)
 
 
 class Primal(NamedTuple):
@@ -53,12 +54,13 @@ class Primal(NamedTuple):
 
 
 class Dual(NamedTuple):
-    """What the solver's multipliers show: an upper bound of t*, and the twist behind it.
+    """What the solver's multipliers show: an upper bound of t*, the twist behind it, and the one that escapes.
 
     escapes    (L,) bool: no contact can oppose the twist     deficient  (L,) bool: A has not full rank
     """
 
     upper: Array
+    bound_twist: Array
     twist: Array
     escapes: Array
     deficient: Array
@@ -116,6 +118,7 @@ def judge(tile: Tile, rank: Rank, u: Cone, y: Array, unbounded: Array, tolerance
     status = _status(folded.valid, full_rank, primal, dual, bracket, tolerance)
 
     force = unfold(primal.s, tile.components, *tile.coefficients)
+    bound_twist = _unit_twist(to_body(dual.bound_twist, folded.length, tile.dimension))
     twist = _unit_twist(to_body(dual.twist, folded.length, tile.dimension))
     twist = jnp.where(status == Status.RESISTANT.value, jnp.zeros_like(twist), twist)
     one = jnp.ones_like(folded.norm)
@@ -130,6 +133,7 @@ def judge(tile: Tile, rank: Rank, u: Cone, y: Array, unbounded: Array, tolerance
         valid(count),
         valid(jnp.where(unbounded, jnp.zeros_like(force), force)),
         valid(twist),
+        valid(bound_twist),
     )
 
 
@@ -175,7 +179,7 @@ def _dual_evidence(tile: Tile, rank: Rank, full_rank: Array, y: Array) -> Dual:
     deficient = ~full_rank & unseen
     use_null = deficient & ~escapes
     twist = jnp.where(use_null, null, xi)
-    return Dual(jnp.where(better, bound, upper), twist, escapes, deficient)
+    return Dual(jnp.where(better, bound, upper), xi, twist, escapes, deficient)
 
 
 def _bracket(primal: Primal, dual: Dual) -> Bracket:
