@@ -22,15 +22,14 @@ from typing import Any, NamedTuple
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "tables"))
 
-import jax  # noqa: E402
-import numpy as np  # noqa: E402
-from figures import write_figures  # noqa: E402
-from grasps import KINDS, random_coefficients, random_contacts  # noqa: E402
+import jax
+import numpy as np
+from figures import write_figures
+from grasps import KINDS, random_coefficients, random_contacts
 
 jax.config.update("jax_enable_x64", True)
 
 import jaxgrasp as jg  # noqa: E402
-from jaxgrasp.quality import with_friction_factor  # noqa: E402
 
 MORE = ("near duplicate", "no friction", "little friction", "near critical")
 SHAPES = (2, 4, 8, 16)  # contacts, padding included: the active ones are 1 to 16
@@ -53,7 +52,9 @@ class Model(NamedTuple):
         return jg.Grasp(position, normal, models[self.name](), active)
 
 
-MODELS = tuple(Model(*x) for x in (("frictionless", 3), ("hard", 3), ("soft", 3), ("frictionless", 2), ("hard", 2)))
+MODELS = tuple(
+    Model(*x) for x in (("frictionless", 3), ("hard", 3), ("soft", 3), ("frictionless", 2), ("hard", 2))
+)
 
 
 def draw(kind: str, model: Model, width: int, count: int, chunk: int = 0) -> tuple[np.ndarray, ...]:
@@ -129,7 +130,9 @@ def tally(grasp: jg.Grasp) -> Tally:
     accepted = np.asarray(jg.check(grasp, answer))
     contradicted = 0
     if grasp.dtype == np.float32:
-        exact = jg.wrench_resistance(jax.tree.map(lambda x: x if x.dtype == bool else x.astype(np.float64), grasp))
+        exact = jg.wrench_resistance(
+            jax.tree.map(lambda x: x if x.dtype == bool else x.astype(np.float64), grasp)
+        )
         contradicted = int(((lower > np.asarray(exact.upper)) | (upper < np.asarray(exact.lower))).sum())
     is_ = {s: status == s.value for s in jg.Status}
     marginal, undecided = is_[jg.Status.MARGINAL], is_[jg.Status.UNDECIDED]
@@ -155,7 +158,9 @@ def measure(kind: str, dtype: str, count: int) -> tuple[Tally, dict[str, int]]:
             here = Tally()
             for chunk, start in enumerate(range(0, share, CHUNK)):
                 data = draw(kind, model, width, CHUNK if share > CHUNK else share, chunk)
-                data = tuple(x[: share - start] if x.dtype == bool else x[: share - start].astype(dtype) for x in data)
+                data = tuple(
+                    x[: share - start] if x.dtype == bool else x[: share - start].astype(dtype) for x in data
+                )
                 here += tally(model.grasp(*data))
             total += here
             if here.earnest:
@@ -175,7 +180,9 @@ def markdown(rows: dict[str, Tally]) -> str:
 
 def main() -> None:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--json", type=Path)
     parser.add_argument("--markdown", type=Path)
     parser.add_argument("--count", type=int, default=1_000_000)
@@ -196,7 +203,11 @@ def main() -> None:
     if options.markdown:
         options.markdown.write_text("\n\n".join(texts) + "\n")
     options.markdown = None
-    machine = {"jax": jax.__version__, "python": sys.version.split()[0], "device": jax.devices()[0].device_kind}
+    machine = {
+        "jax": jax.__version__,
+        "python": sys.version.split()[0],
+        "device": jax.devices()[0].device_kind,
+    }
     write_figures(options, machine, **figures)
 
 

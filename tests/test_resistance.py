@@ -374,3 +374,33 @@ def test_one_grasp_under_jit(k, dimension):
     eager, jitted = jg.wrench_resistance(grasp), jax.jit(jg.wrench_resistance)(grasp)
     assert int(jitted.status[0]) == int(eager.status[0]) != 0
     np.testing.assert_allclose(jitted.margin, eager.margin, atol=1e-8)
+
+
+@F32
+def test_numbers_that_over_or_underflow_are_invalid_or_solved(dtype):
+    """The tetrahedron at mu = 0.5 has margin 1 at every size; squares of sizes beyond 2^+-256 would not hold."""
+    tiny, huge = (1e-310, 1e308) if dtype == "float64" else (1e-40, 3e38)
+    limit = 2.0**256 if dtype == "float64" else 2.0**32
+    sizes = [tiny, 1e-160 if dtype == "float64" else 1e-20, 1.8 / limit, 1.0, limit, 4 * limit, huge]
+    position = np.array(sizes)[:, None, None] * TETRAHEDRON
+    grasp = jg.Grasp(position.astype(dtype), -TETRAHEDRON.astype(dtype), jg.HardFinger(0.5))
+    res = jg.wrench_resistance(grasp)
+    assert list(res.status) == [Status.INVALID] * 2 + [Status.RESISTANT] * 3 + [Status.INVALID] * 2
+    np.testing.assert_allclose(res.margin[2:5], 1.0, atol=TIGHT[dtype])
+    np.testing.assert_array_equal(jg.contacts.is_grasp(grasp), np.asarray(res.status) == Status.RESISTANT)
+    lengths = np.array([tiny, 2 * np.finfo(dtype).tiny, 1.0, huge])
+    normal = (-lengths[:, None, None] * TETRAHEDRON).astype(dtype)
+    res = jg.wrench_resistance(jg.Grasp(TETRAHEDRON.astype(dtype), normal, jg.HardFinger(0.5)))
+    assert list(res.status) == [Status.INVALID] + [Status.RESISTANT] * 3
+    np.testing.assert_allclose(res.margin[1:], 1.0, atol=TIGHT[dtype])
+
+
+@pytest.mark.parametrize("dtype", ["float16", "bfloat16"])
+def test_half_precision_is_refused_with_what_to_do(dtype):
+    half = jnp.asarray(TETRAHEDRON, dtype)
+    for position, friction in ((half, 0.5), (TETRAHEDRON, jnp.full(4, 0.5, dtype))):
+        with pytest.raises(ValueError, match=f"{dtype}, but proofs need float32 or float64: convert first"):
+            jg.Grasp(position, -TETRAHEDRON, jg.HardFinger(friction))
+    whole = jg.Grasp(TETRAHEDRON, -TETRAHEDRON, jg.HardFinger(0.5))
+    with pytest.raises(ValueError, match=f"{dtype}, but proofs need"):
+        jg.wrench_resistance(jax.tree.map(lambda x: x.astype(dtype) if x.dtype != bool else x, whole))

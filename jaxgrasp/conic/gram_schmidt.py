@@ -72,21 +72,32 @@ def _column(norm: Array, reciprocal: Array, products: Array | None) -> Array:
     return pivot if products is None else jnp.concatenate([pivot, products])
 
 
+@stage
+def _grown(floor: Array, lower: list[Array], floors: list[Array], inverse: list[Array]) -> Array:
+    """``floor + sum_j |L_ij| floor_j / L_jj``: an error in row j turns q_j by its share of the pivot."""
+    i = len(lower)
+    for j, column in enumerate(lower):
+        floor = floor + jnp.abs(column[i - j]) * floors[j] * inverse[j]
+    return floor
+
+
 def orthonormal_rows(columns: Cone, floor: Array | list[Array]) -> tuple[Cone, Cholesky]:
     """``A = L Q`` with orthonormal rows of Q, by modified Gram-Schmidt, for A given as d arrays (m, k, L).
 
-    A row whose remainder is not longer than ``floor`` (one for all, or one a row) depends on those above it and becomes
-    zero. Each remainder is cleared of the rows above once more: twice is enough (Kahan, Parlett) for orthogonality to
-    rounding. The components stand side by side in one array: compiling costs a fusion an array.
+    A row whose remainder is not longer than its floor depends on those above it and becomes zero. ``floor``: one a row,
+    or the error of a row of A, which grows with the inverse pivots above. Each remainder is cleared of the rows above
+    once more: twice is enough (Kahan, Parlett) for orthogonality to rounding. The components stand side by side in one
+    array: compiling costs a fusion an array.
     """
     m = columns[0].shape[0]
-    floors = floor if isinstance(floor, list) else [floor] * m
     rest = _stacked(columns)
     rows: list[Array] = []
     lower: list[Array] = []
     inverse: list[Array] = []
+    floors: list[Array] = []
     for i in range(m):
         remainder = _reorthogonalized(rows, rest, _overlaps(rows, rest)) if rows else rest[0]
+        floors.append(floor[i] if isinstance(floor, list) else _grown(floor, lower, floors, inverse))
         norm, reciprocal = _row_norm(remainder, floors[i])
         row, products = _row(remainder, reciprocal), None
         if i < m - 1:

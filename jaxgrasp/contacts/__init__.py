@@ -38,7 +38,7 @@ from .projection import (
     to_twist,
 )
 from .tiled_derivatives import BatchAxes, filled, masked, safe_contacts, tiled, tiled_solver, zero_tangent
-from .validity import is_grasp, sound_contacts
+from .validity import is_grasp, sound
 
 __all__ = [
     "Axes",
@@ -83,7 +83,7 @@ __all__ = [
     "project",
     "safe_contacts",
     "smallest_slack",
-    "sound_contacts",
+    "sound",
     "stored_norm",
     "tile_of",
     "tiled",

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..backend import stage, to_lanes
-from ..conic import Cone, cone_all, cone_any, cone_max, cone_sum, entries, inner
-from ..core import Array, cross_components, frame_components, normalize_components
+from ..conic import Cone, cone_max, cone_sum, entries, inner
+from ..core import Array, cross_components, frame_components, normalize_components, require_precision
 from .grasp import Grasp
 from .models import Component
-from .validity import sound_contacts
+from .validity import sound
 
 __all__ = ["Contacts", "Folded", "contacts_of", "fold", "normal_first", "resultant", "unfold"]
 
@@ -56,8 +56,8 @@ def _valid_and_live(
     position: Array, normal: Array, friction: Array, torsion: Array, active: Array
 ) -> tuple[Array, Array]:
     """Which lanes are grasps (L,), and which of their contacts count (k, L)."""
-    sound = sound_contacts(_coordinates(position), _coordinates(normal), friction, torsion) | ~active
-    valid = cone_all(sound) & cone_any(active)
+    coordinates = _coordinates(position), _coordinates(normal)
+    valid = sound(*coordinates, friction, torsion, active, cone_max)
     return valid, active & valid
 
 
@@ -138,7 +138,8 @@ def normal_first(components: tuple[Component, ...]) -> tuple[Component, ...]:
 
 
 def contacts_of(grasp: Grasp) -> Contacts:
-    """The arrays the lanes are made of."""
+    """The arrays the lanes are made of; ValueError where they are neither float32 nor float64."""
+    require_precision(grasp.dtype, "the grasp")
     return Contacts(
         grasp.position,
         grasp.normal,

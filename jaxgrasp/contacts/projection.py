@@ -46,7 +46,8 @@ class Projection(NamedTuple):
 
     basis   the tile with Q in place of A
     factor  L
-    sigma   (L,) proven lower bound of the smallest singular value of A, 0 where none is proven; sigma > 0 proves rank m
+    sigma   (L,) proven lower bound of the smallest singular value of A, 0 where it is not above ``rank_tolerance``
+            times |A|; sigma > 0 proves rank m
     """
 
     basis: Folded
@@ -61,7 +62,8 @@ def project(folded: Folded) -> Projection:
     basis = folded._replace(columns=columns, resultant=resultant(columns[0]))
     rounding = rounding_constant() * unit_roundoff(dtype) * folded.norm
     sigma = 1 / jnp.sqrt(inverse_frobenius(factor)) - rounding
-    return Projection(basis, factor, jnp.maximum(sigma, jnp.zeros_like(sigma)))
+    clear = sigma > rank_tolerance(dtype) * folded.norm
+    return Projection(basis, factor, jnp.where(clear, sigma, jnp.zeros_like(sigma)))
 
 
 class Tile(NamedTuple):

@@ -1,7 +1,20 @@
 """Ground floor: array vocabulary, tolerances by dtype, statuses, rigid-body geometry, errors. It knows no grasp."""
 
 from .answer import Answer
-from .arrays import Array, ArrayLike, Bool, Float, Index, Int, as_array, placed, real_array, uniform, widened
+from .arrays import (
+    Array,
+    ArrayLike,
+    Bool,
+    Float,
+    Index,
+    Int,
+    as_array,
+    placed,
+    real_array,
+    require_precision,
+    uniform,
+    widened,
+)
 from .broadcast import spread
 from .errors import UserError
 from .geometry import (
@@ -36,10 +49,12 @@ from .tolerances import (
     gap_floor,
     gap_goal,
     largest_response,
+    perturbation_tolerance,
     pivot_tolerance,
     proven_limit,
     rank_tolerance,
     rounding_constant,
+    size_limit,
     stationary_tolerance,
     unit_roundoff,
     visibility_tolerance,
@@ -79,16 +94,19 @@ __all__ = [
     "normalize_components",
     "orientation_matrix",
     "part_of",
+    "perturbation_tolerance",
     "pivot_tolerance",
     "placed",
     "proven_limit",
     "rank_tolerance",
     "real_array",
+    "require_precision",
     "renamed",
     "rotate",
     "rotate_wrench",
     "rotation_between",
     "rounding_constant",
+    "size_limit",
     "safe_root",
     "skew",
     "spread",

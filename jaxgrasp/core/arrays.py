@@ -23,6 +23,7 @@ __all__ = [
     "on_host",
     "placed",
     "real_array",
+    "require_precision",
     "uniform",
     "widened",
 ]
@@ -38,10 +39,20 @@ def real_array(value: ArrayLike, name: str, means: str = "a number or an array o
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be {means}, got {value!r}") from error
     if jnp.issubdtype(array.dtype, jnp.floating):
+        require_precision(array.dtype, name)
         return array
     if not jnp.issubdtype(array.dtype, jnp.integer):
         raise ValueError(f"{name} must hold real numbers, got dtype {array.dtype}")
     return array.astype(jnp.result_type(float))
+
+
+def require_precision(dtype: DTypeLike, name: str) -> None:
+    """ValueError for float16, bfloat16 and other floating dtypes than float32 and float64."""
+    if jnp.dtype(dtype) not in (np.float32, np.float64):
+        raise ValueError(
+            f"{name} has dtype {jnp.dtype(dtype).name}, but proofs need float32 or float64: convert first, e.g. "
+            'with .astype("float32")'
+        )
 
 
 def as_array(value: ArrayLike) -> Array:

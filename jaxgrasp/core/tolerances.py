@@ -16,9 +16,11 @@ __all__ = [
     "gap_goal",
     "largest_response",
     "pivot_tolerance",
+    "perturbation_tolerance",
     "proven_limit",
     "rank_tolerance",
     "rounding_constant",
+    "size_limit",
     "stationary_tolerance",
     "unit_roundoff",
     "visibility_tolerance",
@@ -50,6 +52,14 @@ def gap_goal(tolerance: ArrayLike, dtype: DTypeLike) -> Array:
 def rank_tolerance(dtype) -> float:
     """A singular value at or below this times the largest one counts as zero: 64 eps."""
     return 64 * unit_roundoff(dtype)
+
+
+def perturbation_tolerance(dtype) -> float:
+    """What "holds only by rounding" may change: 32 eps in positions over L, normals, and twice that in mu, gamma / L.
+
+    The checker allows 64 eps for each.
+    """
+    return 32 * unit_roundoff(dtype)
 
 
 def pivot_tolerance(dtype) -> float:
@@ -105,6 +115,14 @@ def rounding_constant() -> float:
     Twice the checker's, so that what the solver certifies the checker accepts.
     """
     return 32.0
+
+
+def size_limit(dtype) -> float:
+    """Lengths in m lie between this and its inverse, mu and gamma / L below it: 2^256 (float64), 2^32 (float32).
+
+    Products of four such numbers neither over- nor underflow.
+    """
+    return 2.0 ** (np.finfo(jnp.dtype(dtype)).maxexp // 4)
 
 
 def proven_limit(dtype) -> float:

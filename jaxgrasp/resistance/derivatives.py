@@ -177,6 +177,8 @@ def _tangents(form: _Form, result: Solved, contacts: Contacts, change: Any) -> S
 
     back = partial(batch.back, ok)
     zero = jax.tree.map(zero_tangent, result)
-    verdict = zero.verdict._replace(margin=back(-cost), internal_force=back(force), escape_twist=back(turned))
+    verdict = zero.verdict._replace(
+        margin=back(-cost), upper=back(-cost), internal_force=back(force), escape_twist=back(turned)
+    )
     moves = (back(-moved.y), back(jnp.stack(moved.u)), back(jnp.stack(moved.z)))
     return zero._replace(verdict=verdict, point=moves)

@@ -12,12 +12,24 @@ lambda = 0 its dual, so the bracket [1 - <c, u>, 1 - <b, y>] around t* holds fro
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import NamedTuple
 
 import jax.numpy as jnp
 
 from ..backend import stage
-from ..conic import Cone, LinearConeProgram, LinearPoint, cone_max, cone_sum, inner, tail_norm, vector_inner
+from ..conic import (
+    Cone,
+    LinearConeProgram,
+    LinearPoint,
+    cone_max,
+    cone_sum,
+    entries,
+    inner,
+    rmatvec,
+    tail_norm,
+    vector_norm,
+)
 from ..contacts import (
     Folded,
     Projection,
@@ -28,9 +40,9 @@ from ..contacts import (
     stored_norm,
     to_twist,
 )
-from ..core import Array, unit_roundoff
+from ..core import Array, perturbation_tolerance, unit_roundoff
 
-__all__ = ["Start", "identity", "margin_program", "starting_point", "upper_bound"]
+__all__ = ["Start", "identity", "bound_of", "margin_program", "starting_point", "upper_bound"]
 
 
 START_DEPTH = 0.3  # how far inside the cones the first forces lie, relative to their tangential size
@@ -64,6 +76,22 @@ def _interior(exists: Array, s: Cone, lower: Array) -> Cone:
     return (first, *(exists * x for x in s[1:]))
 
 
+@stage
+def _alike(columns: Cone, exists: Array, twist: Array) -> Array:
+    """Whether A^T twist is e for some numbers within rounding of the grasp's, and the twist no null vector of A."""
+    dtype = twist.dtype
+    near, size = perturbation_tolerance(dtype), vector_norm(twist)
+    x, zero = rmatvec(columns, twist), jnp.zeros_like(exists)
+    off = exists * jnp.abs(x[0] - 1)
+    for c, tail in zip(columns[1:], x[1:], strict=True):
+        scale = jnp.sqrt(reduce(jnp.add, [row * row for row in entries(c)])[0])
+        gone = scale <= 2 * near
+        off = jnp.maximum(
+            off, jnp.where(gone, zero, jnp.abs(tail) / jnp.where(gone, jnp.ones_like(scale), scale))
+        )
+    return (cone_max(off) <= near * size) & (size * 128 * near <= 1)
+
+
 def starting_point(folded: Folded, projection: Projection) -> Start:
     """A strictly feasible primal-dual start, from the orthogonal projection of unit normal forces onto Null(A)."""
     dtype = folded.norm.dtype
@@ -72,12 +100,13 @@ def starting_point(folded: Folded, projection: Projection) -> Start:
     y = projection.basis.resultant  # Q e, so Q^T y is the part of e that no internal force can have
     raw = onto_null_space(projection, e)
     square = cone_sum(inner(raw, raw))
-    unbounded = square <= (1024 * eps) ** 2 * folded.count
+    twist = to_twist(projection, y)
+    unbounded = (square <= (1024 * eps) ** 2 * folded.count) & _alike(folded.columns, folded.exists, twist)
     s = normalized(folded, raw)
     lower = smallest_slack(folded.exists, s)
     lower = jnp.where(unbounded, jnp.full_like(lower, -jnp.inf), lower)
     opposing = tuple(a - b for a, b in zip(e, raw, strict=True))
-    twist_size = stored_norm(to_twist(projection, y))
+    twist_size = stored_norm(twist)
     escape = smallest_slack(folded.exists, opposing) > 64 * eps * folded.norm * twist_size
 
     u = _interior(folded.exists, s, jnp.where(unbounded, jnp.zeros_like(lower), lower))
@@ -105,24 +134,25 @@ def margin_program(folded: Folded) -> LinearConeProgram:
 
 
 @stage
-def _gauge(exists: Array, count: Array, v: Cone) -> Array:
-    reach = v[0] + tail_norm(v)
-    worst = cone_max(jnp.where(exists > 0, reach, jnp.full_like(reach, -jnp.inf)))
-    return count * worst - cone_sum(exists * v[0])
+def bound_of(folded: Folded, x: Cone, rounding: Array) -> Array:
+    """``1 - sum_i x_0,i / rho`` with ``rho = k max_i (|x_1..,i| - x_0,i) + sum_i x_0,i``, x = -A^T y: t* is not larger.
+
+    1 / rho is the largest multiple of y that the dual admits, so the bound needs no feasible y. ``rounding`` (k, L) of
+    x: where t* is hugely negative rho is the small difference of large sums, and t* follows it squared.
+    """
+    exists = folded.exists
+    worst = cone_max(jnp.where(exists > 0, tail_norm(x) - x[0] + rounding, jnp.full_like(x[0], -jnp.inf)))
+    total, blur = cone_sum(exists * x[0]), cone_sum(exists * rounding)
+    gauge, descent = folded.count * worst + total + blur, total - blur
+    useful = (descent > 0) & (gauge > 0)
+    return 1 - jnp.where(
+        useful, descent / jnp.where(useful, gauge, jnp.ones_like(gauge)), jnp.zeros_like(gauge)
+    )
 
 
 def upper_bound(folded: Folded, y: Array) -> Array:
-    """``1 + a.y / rho(y)`` with ``rho(y) = k max_i (v_n,i + |v_t,i|) - sum_i v_n,i``, ``v = A^T y``: t* is not larger.
-
-    1 / rho is the largest multiple of y that the dual admits, so the bound needs no feasible y. rho grows by the
-    rounding of v: where t* is hugely negative it is the small difference of large sums, and t* follows it squared.
-    """
+    """``bound_of`` the multipliers y of A with orthonormal rows."""
     zero = tuple(jnp.zeros_like(folded.exists) for _ in folded.columns)
-    v = minus_transposed(folded.columns, zero, -y)
-    rounding = 4 * unit_roundoff(folded.norm.dtype) * folded.count * stored_norm(y)
-    gauge = _gauge(folded.exists, folded.count, v) + rounding
-    descent = vector_inner(folded.resultant, y)
-    useful = (descent < 0) & (gauge > 0)
-    return 1 + jnp.where(
-        useful, descent / jnp.where(useful, gauge, jnp.ones_like(gauge)), jnp.zeros_like(gauge)
-    )
+    x = minus_transposed(folded.columns, zero, y)
+    rounding = 4 * unit_roundoff(folded.norm.dtype) * stored_norm(y)
+    return bound_of(folded, x, jnp.broadcast_to(rounding, folded.exists.shape))

@@ -35,7 +35,10 @@ from ..conic import (
     LinearState,
     begin_linear_cone_program,
     cone_max,
+    cone_min,
     cone_sum,
+    inner,
+    rmatvec,
     row_svd,
     solve_linear_cone_program,
     vector_norm,
@@ -49,6 +52,7 @@ from ..core import (
     Status,
     bracket_width,
     gap_goal,
+    perturbation_tolerance,
     rank_tolerance,
     rounding_constant,
     unit_roundoff,
@@ -56,7 +60,7 @@ from ..core import (
 )
 from .derivatives import Scales, Solved, differentiable
 from .problem import Start, margin_program, starting_point
-from .verdict import Rank, Verdict, judge
+from .verdict import Rank, Verdict, judge, unnoticed
 
 __all__ = ["WrenchResistance", "wrench_resistance"]
 
@@ -187,15 +191,16 @@ class _Lanes(NamedTuple):
 
     @property
     def deficient(self) -> Array:
-        """(L,) bool: singular values say that the rank is not full."""
+        """(L,) bool: some numbers within rounding of the grasp's have not full rank, and nor has A."""
         asked = (self.tile.projection.sigma <= 0) & (self.rank.count >= 0)
-        return asked & (self.rank.count < wrench_dimension(self.tile.dimension))
+        return asked & (self.rank.count < wrench_dimension(self.tile.dimension)) & unnoticed(self.rank)
 
     @property
     def sigma(self) -> Array:
         """(L,) a lower bound of the smallest singular value of A; 0 where there is none."""
         sigma = self.tile.projection.sigma
-        return jnp.where((sigma > 0) | self.doubtful | self.deficient, sigma, self.rank.smallest)
+        full = ~self.doubtful & (self.rank.count >= wrench_dimension(self.tile.dimension))
+        return jnp.where((sigma <= 0) & full, self.rank.smallest, sigma)
 
 
 def _stopped(state: LinearState, decided: Array) -> LinearState:
@@ -245,16 +250,35 @@ def _advance(
     return _progress(plan, lanes, state, tolerance)
 
 
+def _certain_contacts(contacts: Contacts, length: Array) -> Contacts:
+    """Coefficients 1 and L in place of mu and gamma, and 0 where rounding could make them 0.
+
+    A twist that these contacts do not notice, rounded numbers of the grasp do not notice either: mu x_t = 0 for mu > 0
+    means x_t = 0. However little friction there is, their singular values are those of the geometry.
+    """
+    limit, L = 2 * perturbation_tolerance(length.dtype), length[:, None]
+    one, zero = jnp.ones_like(contacts.friction), jnp.zeros_like(contacts.friction)
+    return contacts._replace(
+        friction=jnp.where(contacts.friction > limit, one, zero),
+        torsion=jnp.where(contacts.torsion > limit * L, L, zero),
+    )
+
+
 def _rank_kernel(plan: _Plan) -> Callable[[Contacts], Rank]:
     @kernel
     def run(contacts: Contacts) -> Rank:
         folded = fold(contacts, plan.components)
-        A = jnp.concatenate(folded.columns, axis=1)
-        svd = row_svd(A)
-        smallest, null = svd.smallest()
-        largest = cone_max(svd.values)
-        count = cone_sum((svd.values > rank_tolerance(A.dtype) * largest).astype(A.dtype))
-        return Rank(count, smallest, to_rows(null))
+        certain = fold(_certain_contacts(contacts, folded.length), plan.components, folded.length)
+        both = (jnp.concatenate(x.columns, axis=1) for x in (folded, certain))
+        svd, width = row_svd(jnp.concatenate(tuple(both), axis=-1)), plan.width
+        values = svd.values[:, :width]
+        counts = values > rank_tolerance(values.dtype) * cone_max(values)
+        smallest = cone_min(jnp.where(counts, values, jnp.full_like(values, jnp.inf)))
+        _, null = svd.smallest()
+        null = null[:, width:]
+        x = rmatvec(certain.columns, null)
+        noticed = cone_max(certain.exists * jnp.sqrt(inner(x, x)))
+        return Rank(cone_sum(counts.astype(values.dtype)), smallest, to_rows(null), noticed)
 
     return run
 
@@ -262,7 +286,7 @@ def _rank_kernel(plan: _Plan) -> Callable[[Contacts], Rank]:
 def _solve_rows(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array) -> Solved:
     """All sweeps over the first ``count`` of (N, ..) rows; N is a multiple of the tile width."""
     n, m, dtype = contacts.position.shape[0], wrench_dimension(plan.dimension), contacts.position.dtype
-    unknown = Rank(jnp.full(n, -1, dtype), jnp.zeros(n, dtype), jnp.zeros((n, m), dtype))
+    unknown = Rank(jnp.full(n, -1, dtype), jnp.zeros(n, dtype), jnp.zeros((n, m), dtype), jnp.ones(n, dtype))
     rank_of = _rank_kernel(plan)
 
     def step(contacts: Contacts, ranks: Rank, progress: _Progress, sweep: Array) -> _Progress:
@@ -293,7 +317,7 @@ def _answer(solved: Solved) -> WrenchResistance:
     return WrenchResistance(
         found.status,
         found.margin,
-        found.margin + found.gap,
+        found.upper,
         rank,
         found.internal_force,
         found.escape_twist,
@@ -348,11 +372,11 @@ def wrench_resistance(
         raise ValueError(f"wrench_resistance takes a jaxgrasp.Grasp, got {type(grasp).__name__}")
     if isinstance(tolerance, int | float) and not tolerance > 0:
         raise ValueError(f"tolerance must be positive, got {tolerance}")
+    contacts = contacts_of(grasp)
     components = grasp.model.components(grasp.dimension)
     width = tile_width(wrench_dimension(grasp.dimension) * grasp.contacts * len(components))
     plan = _Plan(components, grasp.dimension, bool(verdict_only), width, False)
     goal = gap_goal(tolerance, grasp.dtype)
-    contacts = contacts_of(grasp)
     traced = is_traced((contacts, goal))
     if traced or jax.default_backend() != "cpu":
         return _compiled(plan._replace(with_point=not verdict_only))(contacts, goal)

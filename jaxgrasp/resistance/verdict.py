@@ -14,18 +14,28 @@ import jax.numpy as jnp
 from ..backend import stage
 from ..conic import Cone, cone_min, cone_sum, entries, inner, interior_distance, matvec, rmatvec, vector_norm
 from ..contacts import Folded, Tile, normalized, onto_null_space, smallest_slack, to_body, to_twist, unfold
-from ..core import Array, Status, first_of, rank_tolerance, rounding_constant, unit_roundoff
-from .problem import upper_bound
+from ..core import Array, Status, first_of, perturbation_tolerance, rounding_constant, unit_roundoff
+from .problem import bound_of, upper_bound
 
-__all__ = ["Rank", "Verdict", "judge"]
+__all__ = ["Rank", "Verdict", "judge", "unnoticed"]
 
 
 class Rank(NamedTuple):
-    """Rank of A by its singular values: count (L,), smallest value (L,), its left vector (m, L)."""
+    """Rank of A by its singular values: how many count (L,), the smallest of those (L,).
+
+    null_twist  (m, L) the unit twist that the contacts notice least
+    noticed     (L,) how much the one that notices it most does, in numbers of the grasp (``unnoticed``)
+    """
 
     count: Array
     smallest: Array
     null_twist: Array
+    noticed: Array
+
+
+def unnoticed(rank: Rank) -> Array:
+    """Whether some numbers within rounding of the grasp's do not notice the null twist at all."""
+    return rank.noticed <= perturbation_tolerance(rank.noticed.dtype)
 
 
 class Verdict(NamedTuple):
@@ -33,7 +43,7 @@ class Verdict(NamedTuple):
 
     status: Array
     margin: Array
-    gap: Array
+    upper: Array
     rank: Array
     internal_force: Array  # (k n, L)
     escape_twist: Array  # (m, L)
@@ -67,10 +77,10 @@ class Dual(NamedTuple):
 
 
 class Bracket(NamedTuple):
-    """t* lies in [lower, lower + gap] (L,); ``blur`` is what rounding can do to an end."""
+    """t* lies in [lower, upper] (L,); ``blur`` is what rounding can do to an end."""
 
     lower: Array
-    gap: Array
+    upper: Array
     blur: Array
 
 
@@ -88,19 +98,17 @@ def _unit_twist(y: Array) -> Array:
 
 
 @stage
-def _escape_depth(columns: Cone, exists: Array, xi: Array, rounding: Array) -> Array:
-    """``min_i x_0,i - |x_1..,i| - c eps |A_i|`` with ``x = A^T xi``: positive proves that xi escapes."""
-    x = rmatvec(columns, xi)
+def _velocities(columns: Cone, exists: Array, xi: Array) -> tuple[Cone, Array]:
+    """``x_i = A_i^T xi``, and ``|A_i|`` (k, L)."""
     square = reduce(jnp.add, [row * row for c in columns for row in entries(c)])[0]
-    depth = interior_distance(x) - rounding * jnp.sqrt(square)
-    return cone_min(jnp.where(exists > 0, depth, jnp.full_like(depth, jnp.inf)))
+    return rmatvec(columns, xi), exists * jnp.sqrt(square)
 
 
 @stage
-def _unseen(columns: Cone, xi: Array) -> Array:
-    """``|A^T xi|``: zero for a twist that no contact notices."""
-    x = rmatvec(columns, xi)
-    return jnp.sqrt(cone_sum(inner(x, x)))
+def _escape_depth(exists: Array, x: Cone, size: Array, rounding: Array) -> Array:
+    """``min_i x_0,i - |x_1..,i| - c eps |A_i|``: positive proves that the twist behind x escapes."""
+    depth = interior_distance(x) - rounding * size
+    return cone_min(jnp.where(exists > 0, depth, jnp.full_like(depth, jnp.inf)))
 
 
 def judge(tile: Tile, rank: Rank, u: Cone, y: Array, unbounded: Array, tolerance: Array) -> Verdict:
@@ -129,7 +137,7 @@ def judge(tile: Tile, rank: Rank, u: Cone, y: Array, unbounded: Array, tolerance
     return Verdict(
         status,
         valid(jnp.where(unbounded, -jnp.inf * one, bracket.lower)),
-        valid(jnp.where(unbounded, jnp.zeros_like(bracket.gap), bracket.gap)),
+        valid(jnp.where(unbounded, -jnp.inf * one, bracket.upper)),
         valid(count),
         valid(jnp.where(unbounded, jnp.zeros_like(force), force)),
         valid(twist),
@@ -143,7 +151,7 @@ def _rounding(folded: Folded) -> Array:
 
 
 def _primal_evidence(tile: Tile, rank: Rank, full_rank: Array, u: Cone) -> Primal:
-    """The exact internal force next to ``s = u - t e``."""
+    """The exact internal force next to ``s = u - t e``: of A, or where its rank is not full of one within rounding."""
     folded, projection, rounding = tile.folded, tile.projection, _rounding(tile.folded)
     eps, one = unit_roundoff(folded.norm.dtype), jnp.ones_like(folded.norm)
     t = 1 - cone_sum(folded.exists * u[0]) / folded.count
@@ -151,35 +159,39 @@ def _primal_evidence(tile: Tile, rank: Rank, full_rank: Array, u: Cone) -> Prima
     s = normalized(folded, onto_null_space(projection, s))
     slack = smallest_slack(folded.exists, s)
     residual, size = _norms(folded.columns, s)
-    sigma = jnp.where(projection.sigma > 0, projection.sigma, rank.smallest)
-    room = sigma - rounding * folded.norm
-    safe = jnp.where(room > 0, room, one)
+    svd = rank.smallest - rounding * folded.norm / 2
+    room = jnp.where(projection.sigma > 0, projection.sigma - rounding * folded.norm, svd)
+    known = room > 0
+    safe = jnp.where(known, room, one)
     shift = jnp.sqrt(2 * one) * (residual + rounding * folded.norm * size) / safe
     # The exact internal force lies within near / 2 of s.
-    near = 2 * jnp.sqrt(2 * one) * (residual + 4 * eps * folded.norm * size) / safe
-    certain = full_rank & (room > 0)
-    return Primal(s, slack, jnp.where(certain, near, jnp.zeros_like(near)), certain & (shift < slack))
+    near = 2 * jnp.sqrt(2 * one) * (residual + _evaluation(s) * folded.norm * size) / safe
+    near = jnp.where(known, near + 8 * eps * size, jnp.inf * one)
+    return Primal(s, slack, near, full_rank & known & (shift < slack))
+
+
+def _evaluation(s: Cone) -> float:
+    """Rounding of ``A s`` over |A| |s| in the working dtype, and what a float64 checker with proven bounds allows."""
+    terms = len(s) * s[0].shape[0]
+    return max(4 * unit_roundoff(s[0].dtype), (terms + 16) * unit_roundoff("float64"))
 
 
 def _dual_evidence(tile: Tile, rank: Rank, full_rank: Array, y: Array) -> Dual:
-    """The bound of t*, and the twist behind it.
+    """The bound of t*, and the twist behind it, evaluated as the twist is stored: on A.
 
     Where t* is huge and negative the iterates may stall, but the twist of the projection still escapes.
     """
     folded, basis = tile.folded, tile.projection.basis
     simple = basis.resultant
-    upper = upper_bound(basis, y)
-    bound = upper_bound(basis, -simple)
-    better = bound < upper
+    better = upper_bound(basis, -simple) < upper_bound(basis, y)
     opposing = jnp.where(better, simple, -y)
     xi = _unit_twist(to_twist(tile.projection, opposing))
-    escapes = _escape_depth(folded.columns, folded.exists, xi, _rounding(folded)) > 0
-    null = rank.null_twist
-    unseen = _unseen(folded.columns, null) <= rank_tolerance(folded.norm.dtype) * folded.norm
-    deficient = ~full_rank & unseen
+    x, size = _velocities(folded.columns, folded.exists, xi)
+    escapes = _escape_depth(folded.exists, x, size, _rounding(folded)) > 0
+    upper = bound_of(folded, x, _evaluation(x) * size)
+    deficient = ~full_rank & unnoticed(rank)
     use_null = deficient & ~escapes
-    twist = jnp.where(use_null, null, xi)
-    return Dual(jnp.where(better, bound, upper), xi, twist, escapes, deficient)
+    return Dual(upper, xi, jnp.where(use_null, rank.null_twist, xi), escapes, deficient)
 
 
 def _bracket(primal: Primal, dual: Dual) -> Bracket:
@@ -188,14 +200,14 @@ def _bracket(primal: Primal, dual: Dual) -> Bracket:
     lower, upper = primal.slack - blur - primal.near, dual.upper + blur
     # Rounding must not turn the bracket round.
     lower, upper = jnp.minimum(lower, upper), jnp.maximum(lower, upper)
-    return Bracket(lower, upper - lower, blur)
+    return Bracket(lower, upper, blur)
 
 
 def _status(
     valid: Array, full_rank: Array, primal: Primal, dual: Dual, bracket: Bracket, tolerance: Array
 ) -> Array:
     close = tolerance + 2 * bracket.blur
-    marginal = full_rank & (bracket.lower >= -close) & (bracket.lower + bracket.gap <= close)
+    marginal = full_rank & (bracket.lower >= -close) & (bracket.upper <= close)
     return first_of(
         [
             (~valid, Status.INVALID),
