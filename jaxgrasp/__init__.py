@@ -16,7 +16,7 @@ Names follow the chapter "Wrench Resistant Grasps". What others call it, and wha
     grasp isotropy, volume                quality.grasp_isotropy(grasp), quality.grasp_volume(grasp)
     small-time local controllability      controllability(grasp, body)
     grasp synthesis, grasp refinement     place_contacts(surface)
-    certificate, proof                    check(grasp, answer, ..)
+    certificate, proof                    check(grasp, answer, ..), prove(grasp, answer, ..)
 
 Rooms, from the ground up: core, certificates, backend, conic, contacts, resistance, forces, quality, motion, lmi,
 objects, surfaces, placement, formats, report, jobs, cli. ``import jaxgrasp.X`` is a module for each.
@@ -26,7 +26,7 @@ import importlib
 
 from . import lmi as lmi
 from . import surfaces as surfaces
-from .certificates import check
+from .certificates import check, prove
 from .contacts import (
     Frictionless,
     Grasp,
@@ -113,6 +113,7 @@ __all__ = [
     "Answer",
     "Status",
     "check",
+    "prove",
     "save_grasp",
     "load_grasp",
 ]

@@ -41,6 +41,7 @@ def rows(n=4, k=2, components=3, dtype="float64"):
         np.full(n, 6, dtype),
         real(n, k * components),
         real(n, 6),
+        real(n, 6),
         np.arange(n, dtype=np.int32),
     )
     return contacts, verdicts
@@ -61,6 +62,7 @@ def test_the_schema_is_the_documented_one():
         "rank": "int8",
         "internal_force": "list<item: double>",
         "escape_twist": "list<item: double>",
+        "bound_twist": "list<item: double>",
         "iterations": "int32",
     }
     assert {field.name: str(field.type) for field in kind} == expected
@@ -89,6 +91,7 @@ def test_there_and_back(tmp_path, dtype):
     back = pq.read_table(path)
     assert back["internal_force"].is_null().to_pylist() == [False, True, False, True]
     assert back["escape_twist"].is_null().to_pylist() == [True, False, False, True]
+    assert back["bound_twist"].is_null().to_pylist() == [False, False, False, True]
     assert back["rank"].to_pylist() == [6, 6, 6, None]
     row, metadata = parquet.read_row(path, 2)
     assert metadata["object"]["name"] == "box" and row["status"] == 3 and row["grasp_id"] == 6
@@ -315,6 +318,7 @@ def test_the_columns_come_from_the_solvers_answer():
         rank=np.array([6, 5, -1]),
         internal_force=np.ones((3, 6)),
         escape_twist=np.zeros((3, 6)),
+        bound_twist=np.ones((3, 6)),
         iterations=np.array([4, 5, 0]),
     )
     found = Verdicts.of(answer, slice(None, 2))

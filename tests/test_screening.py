@@ -18,7 +18,7 @@ from real_data import real_meshes
 
 import jaxgrasp as jg
 from jaxgrasp import objects
-from jaxgrasp.certificates import check_resistance
+from jaxgrasp.certificates import prove_resistance
 from jaxgrasp.core.errors import UserError
 from jaxgrasp.core.status import Status
 from jaxgrasp.formats.contact_file import ContactFile
@@ -83,8 +83,13 @@ def test_every_verdict_in_the_file_is_proved_by_the_file(whole, dtype):
         status=table["status"].to_numpy(),
         internal_force=padded(table, "internal_force", 9),
         escape_twist=padded(table, "escape_twist", 6),
+        bound_twist=padded(table, "bound_twist", 6),
+        lower=table["margin"].to_numpy(),
+        upper=table["upper"].to_numpy(),
+        rank=table["rank"].to_numpy(),
     )
-    assert check_resistance(grasp, evidence).all()
+    proof = prove_resistance(grasp, evidence)
+    assert np.isin(proof.status, (Status.PROVED_EXACTLY, Status.PROVED_TO_ROUNDING)).all()
     assert table["grasp_id"].to_pylist() == list(range(700))
     assert summary.rows == 700 and sum(summary.counts.values()) == 700
     assert summary.counts[Status.RESISTANT] == int((table["status"].to_numpy() == 1).sum()) > 30

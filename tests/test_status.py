@@ -33,6 +33,9 @@ NUMBERS = {
     "PROJECTED": 19,
     "UNREGULATED": 20,
     "FEASIBLE": 21,
+    "PROVED_EXACTLY": 23,
+    "PROVED_TO_ROUNDING": 24,
+    "REFUSED": 25,
 }
 
 

@@ -1,8 +1,11 @@
-"""The checker: every answer proved again in float64, without trusting the solver; NumPy and nothing else of ours."""
+"""The checker: every answer proved again, without trusting the solver; NumPy and nothing else of ours."""
 
-from .check import check, checked_by, force_claim
-from .epsilon import check_epsilon
-from .forces import check_forces
-from .resistance import check_resistance
+from .check import check, force_claim, prove, proved_by
+from .epsilon import prove_epsilon
+from .forces import prove_forces
+from .proof import Proof
+from .resistance import prove_resistance
 
-__all__ = ["check", "check_epsilon", "check_forces", "check_resistance", "checked_by", "force_claim"]
+__all__ = [
+    "Proof", "check", "force_claim", "prove", "prove_epsilon", "prove_forces", "prove_resistance", "proved_by",
+]  # fmt: skip

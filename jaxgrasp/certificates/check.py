@@ -1,7 +1,7 @@
-"""One way to ask for a proof: ``check(grasp, answer, ..)`` proves the caller's problem with the answer's evidence.
+"""One way to ask for a proof: ``prove(grasp, answer, ..)`` proves the caller's problem with the answer's evidence.
 
-Numpy only, and nothing else of this library: a bug elsewhere cannot make a wrong proof look right. Which checker an
-answer needs is registered for its class where the class is defined.
+Numpy and the standard library only, and nothing else of this library: a bug elsewhere cannot make a wrong proof look
+right. Which prover an answer needs is registered for its class where the class is defined.
 """
 
 from __future__ import annotations
@@ -13,27 +13,69 @@ from typing import Any
 
 import numpy as np
 
+from .proof import REFUSED, Proof, refused
+from .reading import Malformed
 from .rebuilt import component_vectors
 
-__all__ = ["check", "checked_by", "force_claim"]
+__all__ = ["check", "force_claim", "prove", "proved_by"]
 
 
 @singledispatch
-def _checker(answer: Any) -> Callable[..., np.ndarray]:
+def _prover(answer: Any) -> Callable[..., Proof]:
     raise ValueError(
-        f"a {type(answer).__name__} carries no certificate; check takes the answers of wrench_resistance, "
+        f"a {type(answer).__name__} carries no certificate; check and prove take the answers of wrench_resistance, "
         "optimize_forces and epsilon_quality"
     )
 
 
-def checked_by(checker: Callable[..., np.ndarray]) -> Callable[[type], type]:
-    """Class decorator: ``checker(grasp, answer, problem, tolerance)`` proves answers of this class."""
+def proved_by(prover: Callable[..., Proof]) -> Callable[[type], type]:
+    """Class decorator: ``prover(grasp, answer, problem, tolerance)`` proves answers of this class."""
 
     def register(kind: type) -> type:
-        _checker.register(kind, lambda answer: checker)
+        _prover.register(kind, lambda answer: prover)
         return kind
 
     return register
+
+
+def prove(
+    grasp,
+    answer,
+    *,
+    wrench=None,
+    criterion=None,
+    max_normal=None,
+    torque_limits=None,
+    tolerance: float | None = None,
+) -> Proof:
+    """What the evidence in ``answer`` proves, lane by lane: a ``Proof``, the shape of ``answer.status``.
+
+    grasp          a ``Grasp``
+    answer         what ``wrench_resistance(grasp)``, ``optimize_forces(grasp, wrench, ..)`` or
+                   ``epsilon_quality(grasp, certificate=True)`` returned
+    wrench, criterion, max_normal, torque_limits
+                   for forces: the problem, exactly as ``optimize_forces`` was asked; wrench and criterion are required.
+                   What is proved is this problem, whatever the answer was made for
+    tolerance      for verdicts: the |t*| that MARGINAL may claim; by default what the answer's own bracket claims, as
+                   long as that is below 1e-3. For forces: the relative gap that OPTIMAL may leave, by default 1e-6.
+                   For epsilon: the rounding its bounds may show, by default 1e-9 of epsilon
+
+    PROVED_EXACTLY      true of the very numbers given (as float64), in real arithmetic, with zero tolerance
+    PROVED_TO_ROUNDING  true of some numbers within 64 eps of them; ``distance`` says how near
+    REFUSED             anything else, and every answer that is damaged: fields missing, of another shape, not numbers
+
+    Runs on the host: floating point with bounds of all rounding first, integers where that leaves a lane open.
+    ``docs/verdicts.md`` says what is asked of each status and field. ValueError for an answer without a certificate,
+    for forces without wrench and criterion, and for a problem of another shape.
+    """
+    problem = SimpleNamespace(
+        wrench=wrench, criterion=criterion, max_normal=max_normal, torque_limits=torque_limits
+    )
+    prover = _prover(answer)
+    try:
+        return prover(grasp, answer, problem, tolerance)
+    except Malformed:
+        return refused(_problem_shape(grasp, problem))
 
 
 def check(
@@ -46,27 +88,22 @@ def check(
     torque_limits=None,
     tolerance: float | None = None,
 ) -> np.ndarray:
-    """Whether the evidence in ``answer`` proves it, lane by lane: numpy bool, the shape of ``answer.status``.
+    """Whether the evidence in ``answer`` proves it, exactly or to rounding: numpy bool, the shape of ``answer.status``.
 
-    grasp          a ``Grasp``
-    answer         what ``wrench_resistance(grasp)``, ``optimize_forces(grasp, wrench, ..)`` or
-                   ``epsilon_quality(grasp, certificate=True)`` returned
-    wrench, criterion, max_normal, torque_limits
-                   for forces: the problem, exactly as ``optimize_forces`` was asked; wrench and criterion are required.
-                   What is proved is this problem, whatever the answer was made for
-    tolerance      for verdicts: the |t*| that MARGINAL may claim; by default what the answer's own bracket claims, as
-                   long as that is below 1e-3. For forces: the relative gap that OPTIMAL may leave, by default 1e-6.
-                   For epsilon: the rounding its bounds may show, by default 1e-9 of epsilon
-
-    Runs on the host in float64 whatever the dtype of the grasp; a few operations a lane. What is asked of each status
-    is written in ``certificates/resistance.py``, ``certificates/forces.py`` and ``certificates/epsilon.py``.
-    ValueError for an answer without a certificate, for forces without wrench and criterion, and for a problem of
-    another shape.
+    Arguments and errors are those of ``prove``, which also says which of the two it is.
     """
-    problem = SimpleNamespace(
-        wrench=wrench, criterion=criterion, max_normal=max_normal, torque_limits=torque_limits
-    )
-    return _checker(answer)(grasp, answer, problem, tolerance)
+    proof = prove(
+        grasp, answer, wrench=wrench, criterion=criterion, max_normal=max_normal,
+        torque_limits=torque_limits, tolerance=tolerance,
+    )  # fmt: skip
+    return (proof.status != REFUSED)[()]
+
+
+def _problem_shape(grasp, problem: SimpleNamespace) -> tuple[int, ...]:
+    """Axes of the grasps, and of the loads after them."""
+    batch = grasp.position.shape[:-2]
+    lead = np.shape(problem.wrench)[:-1] if problem.wrench is not None else ()
+    return tuple(lead) if len(lead) > len(batch) else tuple(batch)
 
 
 def _spread(

@@ -13,9 +13,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from .proof import LEVELS, Proof
 from .rebuilt import Rebuilt, rebuild, scaled_force
 
-__all__ = ["check_epsilon"]
+__all__ = ["check_epsilon", "prove_epsilon"]
 
 RESISTANT, INVALID = 1, 5
 ROUNDING = 1e-9  # of epsilon; of unit effort
@@ -59,6 +60,13 @@ def _support(known: Rebuilt, lane: int, direction: np.ndarray, row_scale: np.nda
     v = np.einsum("kmn,m->kn", known.blocks[lane], direction * row_scale)
     h = np.where(known.live[lane], v[:, 0] + np.linalg.norm(v[:, 1:], axis=-1), 0.0)
     return float(np.maximum(h, 0.0).sum() if norm == "Linf" else max(h.max(), 0.0))
+
+
+def prove_epsilon(grasp, result, tolerance: float | None = None) -> Proof:
+    """What the evidence proves; shape of ``result.status``."""
+    accepted = np.asarray(check_epsilon(grasp, result, tolerance))
+    nan = np.full(accepted.shape, np.nan)
+    return Proof(LEVELS[accepted.astype(int)], np.where(accepted, 0.0, np.inf), nan, nan, np.zeros(accepted.shape))
 
 
 def check_epsilon(grasp, result, tolerance: float | None = None) -> np.ndarray:

@@ -21,9 +21,10 @@ from typing import NamedTuple
 import numpy as np
 
 from .criteria import Asked, Multipliers, cost, lower_bound, robust_sensitivity
+from .proof import LEVELS, Proof
 from .rebuilt import EPS, ROUNDING, Rebuilt, rebuild, scaled_force, scaled_twist, scaled_wrench
 
-__all__ = ["check_forces"]
+__all__ = ["check_forces", "prove_forces"]
 
 INVALID, OPTIMAL, INFEASIBLE, STALLED = 5, 6, 7, 8
 LIMIT = 1e6  # loads
@@ -49,6 +50,13 @@ class Sizes(NamedTuple):
     load: np.ndarray
     A: np.ndarray
     reach: np.ndarray
+
+
+def prove_forces(grasp, result, tolerance: float | None = None) -> Proof:
+    """What the evidence proves; shape of ``result.status``."""
+    accepted = np.asarray(check_forces(grasp, result, tolerance))
+    nan = np.full(accepted.shape, np.nan)
+    return Proof(LEVELS[accepted.astype(int)], np.where(accepted, 0.0, np.inf), nan, nan, np.zeros(accepted.shape))
 
 
 def check_forces(grasp, result, tolerance: float | None = None) -> np.ndarray:

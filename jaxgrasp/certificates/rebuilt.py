@@ -78,6 +78,7 @@ class Rebuilt(NamedTuple):
     """The lanes of a grasp in float64, harmless numbers in lanes and contacts that do not count.
 
     valid (N,), live (N, k): what counts            length (N,): L          friction, torsion (N, k)
+    position, normal (N, k, d): as given
     blocks (N, k, m, n): folded maps, lengths over L, normal column first    A (N, m, k n): the same, side by side
     scale (N, k, n): f = scale s, in the order of the components            components, normal_index
     """
@@ -85,6 +86,8 @@ class Rebuilt(NamedTuple):
     valid: np.ndarray
     live: np.ndarray
     length: np.ndarray
+    position: np.ndarray
+    normal: np.ndarray
     friction: np.ndarray
     torsion: np.ndarray
     blocks: np.ndarray
@@ -115,13 +118,16 @@ def rebuild(grasp) -> Rebuilt:
         usable &= np.isfinite(friction) & np.isfinite(torsion) & (friction >= 0) & (torsion >= 0)
         valid = (usable | ~active).all(-1) & active.any(-1)
         live = active & valid[:, None]
+        given = np.where(live[..., None], normal, 0.0)
         normal = np.where(
             live[..., None], normal / np.where(size > 0, size, 1.0)[..., None], np.eye(dimension)[-1]
         )
         normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
     position = np.where(live[..., None], position, 0.0)
     friction, torsion = np.where(live, friction, 0.0), np.where(live, torsion, 0.0)
-    length = np.max(np.linalg.norm(position, axis=-1), -1)
+    largest = np.max(np.abs(position), (-1, -2))
+    largest = np.where(largest > 0, largest, 1.0)
+    length = largest * np.max(np.linalg.norm(position / largest[:, None, None], axis=-1), -1)
     length = np.where(length > 0, length, 1.0)
     blocks = _folded(
         position / length[:, None, None], normal, friction, torsion / length[:, None], components
@@ -130,7 +136,7 @@ def rebuild(grasp) -> Rebuilt:
     A = np.moveaxis(blocks, 1, 2).reshape(len(blocks), m, k * n)
     by_component = {"f_x": friction, "f_y": friction, "f_n": np.ones_like(friction), "tau_n": torsion}
     scale = np.stack([by_component[c] for c in components], -1)
-    return Rebuilt(valid, live, length, friction, torsion, blocks, A, scale, components, normal_index)
+    return Rebuilt(valid, live, length, position, given, friction, torsion, blocks, A, scale, components, normal_index)
 
 
 def component_vectors(grasp, orientation=None) -> np.ndarray:

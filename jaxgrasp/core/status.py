@@ -97,3 +97,13 @@ class Status(IntEnum):
     )
     # Linear matrix inequalities.
     FEASIBLE = 21, "Feasible: the point satisfies every constraint strictly."
+    # What an answer's evidence proves.
+    PROVED_EXACTLY = (
+        23,
+        "Proved exactly: true of the very numbers given, in real arithmetic, without any tolerance.",
+    )
+    PROVED_TO_ROUNDING = (
+        24,
+        "Proved to rounding: true of numbers so near that rounding tells them from the given ones.",
+    )
+    REFUSED = 25, "Refused: the evidence does not prove what the answer says."

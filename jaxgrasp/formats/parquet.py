@@ -18,6 +18,8 @@ the dtype of the run; ``real[k][3]`` is fixed_size_list<fixed_size_list<real>[3]
                                     they exist, mean normal force 1; null where margin is -inf or NaN
     escape_twist    list<real>      6 numbers: (velocity of the centre of mass; angular velocity), mesh
                                     axes, unit norm; null where there is none
+    bound_twist     list<real>      6 numbers like these: the twist that proves ``upper``; null where INVALID. Files
+                                    of version 0.1 lack it
     iterations      int32           of the solver
 
 (Forces and twists are lists of variable size: few readers take nulls among fixed-size ones. More columns may
@@ -86,6 +88,7 @@ OPTIONS: dict[str, Any] = {
     "write_statistics": ["grasp_id", "status", "margin"],
 }
 VERDICT_COLUMNS = ("status", "margin", "upper", "rank", "internal_force", "escape_twist", "iterations")
+LATER = "bound_twist"  # a column that files of version 0.1 lack
 
 
 @dataclass
@@ -128,12 +131,13 @@ class Verdicts:
     rank: np.ndarray
     internal_force: np.ndarray
     escape_twist: np.ndarray
+    bound_twist: np.ndarray
     iterations: np.ndarray
 
     @classmethod
     def of(cls, answer: WrenchResistance, rows: Any = slice(None)) -> Verdicts:
         """The columns of the ``rows`` of an answer: a slice, numbers or a mask."""
-        names = ("status", "upper", "rank", "internal_force", "escape_twist", "iterations")
+        names = ("status", "upper", "rank", "internal_force", "escape_twist", "bound_twist", "iterations")
         columns = {name: np.asarray(getattr(answer, name))[rows] for name in names}
         return cls(margin=np.asarray(answer.lower)[rows], **columns)
 
@@ -156,6 +160,7 @@ def verdict_schema(fingers: int, dtype: str, metadata: dict[str, Any] | None = N
         ("rank", pa.int8()),
         ("internal_force", pa.list_(real)),
         ("escape_twist", pa.list_(real)),
+        ("bound_twist", pa.list_(real)),
         ("iterations", pa.int32()),
     ]
     return pa.schema(columns, {METADATA_KEY: dump_metadata(metadata)} if metadata is not None else None)
@@ -180,6 +185,7 @@ def verdict_table(contacts: Contacts, verdicts: Verdicts, kind: pa.Schema) -> pa
             verdicts.internal_force, kind.field("internal_force").type, no_force
         ),
         "escape_twist": nullable_lists(twist, kind.field("escape_twist").type, no_twist),
+        "bound_twist": nullable_lists(verdicts.bound_twist, kind.field("bound_twist").type, invalid),
     }
     for name in ("position", "normal", "friction", "torsion", "active"):
         columns[name] = fixed_lists(getattr(contacts, name), kind.field(name).type)
@@ -274,7 +280,7 @@ def read_row(path: Path, row: int) -> tuple[dict[str, Any], dict[str, Any]]:
         former = metadata.get("schema_version") == 1
         names = [{"upper": "gap"}.get(name, name) if former else name for name in VERDICT_COLUMNS]
         require(path, file, (*REQUIRED, "friction", "torsion", "active", *names))
-        values = as_row(row_of(path, file, row))
+        values = {LATER: None} | as_row(row_of(path, file, row))
     if former:
         margin, gap = values["margin"], values.pop("gap")
         values["upper"] = None if margin is None or gap is None else margin + gap

@@ -23,7 +23,7 @@ from jax import lax
 from jax.typing import ArrayLike
 
 from ..backend import batched, in_chunks, is_traced, map_tiles
-from ..certificates import check_epsilon, checked_by
+from ..certificates import prove_epsilon, proved_by
 from ..contacts import Grasp
 from ..core import Answer, Array, Bool, Float, Int, Status
 from ..resistance import WrenchResistance, wrench_resistance
@@ -37,7 +37,7 @@ CAPACITIES = (Capacity(1024, 64, 192, 256), Capacity(16384, 512, 2048, 2048))
 CHUNK = 64  # grasps an executable takes at once when called on concrete arrays
 
 
-@checked_by(lambda grasp, answer, problem, tolerance: check_epsilon(grasp, answer, tolerance))
+@proved_by(lambda grasp, answer, problem, tolerance: prove_epsilon(grasp, answer, tolerance))
 class EpsilonQuality(Answer):
     """``lower <= epsilon <= upper``, in N of resisted wrench (torques over ``torque_scale``) per N of effort.
 

@@ -62,7 +62,7 @@ class StoredGrasp:
 
 @dataclass(frozen=True)
 class Verdict(StoredGrasp):
-    """One grasp and its verdict, in space. Forces (k, n) or None; twist (6,) or None."""
+    """One grasp and its verdict, in space. Forces (k, n) or None; twists (6,) or None."""
 
     status: Status
     margin: float
@@ -70,6 +70,7 @@ class Verdict(StoredGrasp):
     rank: int | None
     force: np.ndarray | None
     twist: np.ndarray | None
+    bound_twist: np.ndarray | None = None
 
     @classmethod
     def from_row(cls, row: dict[str, Any], metadata: dict[str, Any]) -> Verdict:
@@ -101,6 +102,7 @@ class Verdict(StoredGrasp):
             rank=row["rank"],
             force=None if force is None else np.asarray(force, float).reshape(len(position), components),
             twist=None if row["escape_twist"] is None else np.asarray(row["escape_twist"], float),
+            bound_twist=None if row.get("bound_twist") is None else np.asarray(row["bound_twist"], float),
         )
 
 

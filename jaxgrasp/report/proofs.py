@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..backend import precision
-from ..certificates import check, check_resistance
+from ..certificates import check, prove_resistance
 from ..core import Status
 from ..forces import OptimalForces, closeness, make_criterion
 from .answers import ForceAnswer, Verdict
@@ -18,28 +18,33 @@ __all__ = ["reprove_forces", "reprove_verdict"]
 
 
 def reprove_verdict(verdict: Verdict, metadata: dict[str, Any]) -> str:
-    """One sentence: does the stored evidence, checked in float64 without the solver, prove the verdict?"""
+    """One or two sentences: does the stored evidence, checked without the solver, prove the row, and how exactly?"""
     dtype = np.dtype(metadata.get("dtype", "float64"))
+    known = verdict.bound_twist is not None
     with precision(dtype.name):
         grasp = verdict.grasp(dtype)
         nothing = np.zeros(verdict.active.size * len(verdict.components))
         evidence = SimpleNamespace(
             status=np.asarray(verdict.status.value),
+            lower=np.asarray(verdict.margin),
+            upper=np.asarray(verdict.upper if known else max(verdict.margin, 1.0)),  # t* <= 1 needs no proof
+            rank=np.asarray(-1 if verdict.rank is None else verdict.rank),
             internal_force=nothing if verdict.force is None else verdict.force.ravel(),
             escape_twist=np.zeros(6) if verdict.twist is None else verdict.twist,
+            bound_twist=verdict.bound_twist if known else np.zeros(6),
         )
-        proved = bool(check_resistance(grasp, evidence, tolerance=metadata.get("tolerance", 1e-8)))
+        proof = prove_resistance(grasp, evidence, tolerance=metadata.get("tolerance", 1e-8))
+    holds = proof.status != Status.REFUSED
     if verdict.status in (Status.UNDECIDED, Status.INVALID):
-        return (
-            "There is nothing to prove."
-            if proved
-            else "Checked again: the stored numbers do not fit this verdict."
-        )
-    return (
-        "Checked again in float64: the proof holds."
-        if proved
-        else "Checked again: the stored evidence does NOT prove it."
-    )
+        return "There is nothing to prove." if holds else (
+            "Checked again: the stored numbers do not fit this verdict."
+        )  # fmt: skip
+    if not holds:
+        return "Checked again: the stored evidence does NOT prove it."
+    unproved = "" if known or verdict.status == Status.INVALID else (
+        " The upper end of the margin is not proved: a file of version 0.1 holds no evidence of it; screen it again."
+    )  # fmt: skip
+    return f"Checked again without the solver: the proof holds. {proof.sentence()}{unproved}"
 
 
 def reprove_forces(answer: ForceAnswer) -> bool:

@@ -28,7 +28,7 @@ from ..backend import (
     to_lanes,
     to_rows,
 )
-from ..certificates import check_resistance, checked_by
+from ..certificates import prove_resistance, proved_by
 from ..conic import (
     LinearConeProgram,
     LinearPoint,
@@ -70,7 +70,7 @@ VERDICT_BUDGETS = (0, 2, TOTAL_BUDGET - 2)  # ... and most verdicts none, one or
 CHUNK = 4096  # grasps an executable takes at once when called on concrete arrays
 
 
-@checked_by(lambda grasp, answer, problem, tolerance: check_resistance(grasp, answer, tolerance))
+@proved_by(lambda grasp, answer, problem, tolerance: prove_resistance(grasp, answer, tolerance))
 class WrenchResistance(Answer):
     """Verdicts and their proofs, with the batch axes of the grasp in front.
 
