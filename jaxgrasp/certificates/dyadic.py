@@ -3,9 +3,9 @@
     lengths (p_i, gamma_i)  one power for all        normals   one power each: only their direction counts
     mu_i                    one power for all        forces    one power for all
 
-Cones are compared by squares, so nothing is rounded. With h = F . N, q = |F|^2 |N|^2 - h^2 and torque S N, a force lies in
-its cone iff h >= 0 and ``q / mu^2 + S^2 |N|^4 / gamma^2 <= h^2``; with u = v + omega x p and h = u . N, a twist opposes no
-force of the contact iff h >= 0 and ``mu^2 (|u|^2 |N|^2 - h^2) + gamma^2 (omega . N)^2 <= h^2``.
+Cones are compared by squares, so nothing is rounded. With h = F . N, q = |F|^2 |N|^2 - h^2 and torque S N, a force lies
+in its cone iff h >= 0 and ``q / mu^2 + S^2 |N|^4 / gamma^2 <= h^2``; with u = v + omega x p and h = u . N, a twist
+opposes no force of the contact iff h >= 0 and ``mu^2 (|u|^2 |N|^2 - h^2) + gamma^2 (omega . N)^2 <= h^2``.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ class ExactGrasp(NamedTuple):
         return v[0] + turn[0], v[1] + turn[1], v[2] + turn[2]
 
     def dual_sides(self, i: int, twist: Twist) -> tuple[int, Fraction]:
-        """h = u . N and ``|N|^2 |(mu u_t, gamma omega_n)|^2``: no force opposes the twist iff h >= 0 and h^2 is not smaller."""
+        """h = u . N and ``|N|^2 |(mu u_t, gamma omega_n)|^2``: none opposes the twist iff h >= 0 and h^2 is not smaller."""
         n = self.normal[i]
         u, turn = self.velocity(i, twist), dot(twist.rotation, n)
         h = dot(u, n)
@@ -178,7 +178,9 @@ def twist_of(grasp: ExactGrasp, numbers: np.ndarray) -> Twist:
     d = grasp.dimension
     velocity, v_exponent = integers(numbers[:d])
     rotation, w_exponent = integers(numbers[d:])
-    shift = v_exponent - (w_exponent + grasp.length_exponent)  # v = velocity 2^v_exp, in units 2^(w_exp + length_exp)
+    shift = v_exponent - (
+        w_exponent + grasp.length_exponent
+    )  # v = velocity 2^v_exp, in units 2^(w_exp + length_exp)
     if shift >= 0:
         velocity = [x << shift for x in velocity]
     else:

@@ -66,7 +66,9 @@ def prove_epsilon(grasp, result, tolerance: float | None = None) -> Proof:
     """What the evidence proves; shape of ``result.status``."""
     accepted = np.asarray(check_epsilon(grasp, result, tolerance))
     nan = np.full(accepted.shape, np.nan)
-    return Proof(LEVELS[accepted.astype(int)], np.where(accepted, 0.0, np.inf), nan, nan, np.zeros(accepted.shape))
+    return Proof(
+        LEVELS[accepted.astype(int)], np.where(accepted, 0.0, np.inf), nan, nan, np.zeros(accepted.shape)
+    )
 
 
 def check_epsilon(grasp, result, tolerance: float | None = None) -> np.ndarray:

@@ -92,9 +92,7 @@ class _Parts:
         return np.array([wrench[j] / sizes[j] for j in self.grasp.rows])
 
 
-def internal_force(
-    grasp: ExactGrasp, lane: Scaled, s: np.ndarray
-) -> tuple[ForceSet, int] | None:
+def internal_force(grasp: ExactGrasp, lane: Scaled, s: np.ndarray) -> tuple[ForceSet, int] | None:
     """Forces that balance exactly, next to the scaled s (k, n); and the rank of the folded map, m or less.
 
     None where there are none near: the system has no solution. A rank below m is a lower bound only where the first
@@ -143,9 +141,7 @@ def _best_first(grasp: ExactGrasp, lane: Scaled, columns: list[list[int]]) -> li
     """The columns, each time the one that the columns before it explain least (as a pivoted QR does)."""
     length = 1 << max(abs(x).bit_length() for p in grasp.position for x in p)
     d = grasp.dimension
-    rows = np.array(
-        [[_ratio(x, 1 if j < d else length) for j, x in enumerate(column)] for column in columns]
-    )
+    rows = np.array([[_ratio(x, 1 if j < d else length) for j, x in enumerate(column)] for column in columns])
     rows = rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-300)
     rest, order = rows.copy(), []
     left = list(range(len(rows)))

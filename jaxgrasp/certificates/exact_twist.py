@@ -111,10 +111,13 @@ def margin_at_most(grasp: ExactGrasp, lane: Scaled, xi: np.ndarray, claim: float
         tails.append(root_above(square / nn, digits))
     bound, count = Fraction(claim), len(heads)
     total = sum(low for low, _ in heads) if bound >= 0 else sum(high for _, high in heads)
-    return all(
-        bound * total + (1 - bound) * count * (low - tail) >= 0
-        for (low, _), tail in zip(heads, tails, strict=True)
-    ) and sum(low for low, _ in heads) > 0
+    return (
+        all(
+            bound * total + (1 - bound) * count * (low - tail) >= 0
+            for (low, _), tail in zip(heads, tails, strict=True)
+        )
+        and sum(low for low, _ in heads) > 0
+    )
 
 
 def moves_all_alike(grasp: ExactGrasp) -> bool:

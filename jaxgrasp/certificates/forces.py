@@ -56,7 +56,9 @@ def prove_forces(grasp, result, tolerance: float | None = None) -> Proof:
     """What the evidence proves; shape of ``result.status``."""
     accepted = np.asarray(check_forces(grasp, result, tolerance))
     nan = np.full(accepted.shape, np.nan)
-    return Proof(LEVELS[accepted.astype(int)], np.where(accepted, 0.0, np.inf), nan, nan, np.zeros(accepted.shape))
+    return Proof(
+        LEVELS[accepted.astype(int)], np.where(accepted, 0.0, np.inf), nan, nan, np.zeros(accepted.shape)
+    )
 
 
 def check_forces(grasp, result, tolerance: float | None = None) -> np.ndarray:

@@ -11,7 +11,9 @@ __all__ = ["EXACTLY", "LEVELS", "REFUSED", "TO_ROUNDING", "Proof", "refused"]
 
 # As in core.Status: this room imports nothing of ours.
 EXACTLY, TO_ROUNDING, REFUSED = 23, 24, 25
-LEVELS = np.array([REFUSED, TO_ROUNDING, EXACTLY], np.int32)  # inside, a level is 0, 1 or 2: the least of its parts
+LEVELS = np.array(
+    [REFUSED, TO_ROUNDING, EXACTLY], np.int32
+)  # inside, a level is 0, 1 or 2: the least of its parts
 
 WORDS = {
     EXACTLY: "Proved exactly: true of the very numbers given, without any tolerance.",

@@ -13,7 +13,10 @@ from .rebuilt import EPS
 
 __all__ = ["RANK_BAND", "numeric_rank_fits", "rounding_of", "smallest_singular_value"]
 
-RANK_BAND = (32.0, 128.0)  # the rank is the number of singular values above 64 eps |A|_2; both neighbours are accepted
+RANK_BAND = (
+    32.0,
+    128.0,
+)  # the rank is the number of singular values above 64 eps |A|_2; both neighbours are accepted
 
 
 def rounding_of(A: np.ndarray) -> np.ndarray:

@@ -136,7 +136,9 @@ def rebuild(grasp) -> Rebuilt:
     A = np.moveaxis(blocks, 1, 2).reshape(len(blocks), m, k * n)
     by_component = {"f_x": friction, "f_y": friction, "f_n": np.ones_like(friction), "tau_n": torsion}
     scale = np.stack([by_component[c] for c in components], -1)
-    return Rebuilt(valid, live, length, position, given, friction, torsion, blocks, A, scale, components, normal_index)
+    return Rebuilt(
+        valid, live, length, position, given, friction, torsion, blocks, A, scale, components, normal_index
+    )
 
 
 def component_vectors(grasp, orientation=None) -> np.ndarray:

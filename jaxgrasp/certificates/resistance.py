@@ -10,9 +10,9 @@ It rebuilds the folded grasp map A from positions, normals, mu and gamma, length
     lower          the internal force shows t* >= lower         upper   the bound twist shows t* <= upper
     rank           singular values of A above 64 eps |A|
 
-In floating point first, with bounds of all rounding: an exact internal force lies within (|A s| + c |A| |s|) / sigma of s,
-sigma a proven bound of the smallest singular value. What that leaves open is decided in integers, lane by lane.
-A verdict by the rank of A alone may hold only by rounding: then the twist escapes from numbers within 64 eps.
+In floating point first, with bounds of all rounding: an exact internal force lies within (|A s| + c |A| |s|) / sigma of
+s, sigma a proven bound of the smallest singular value. What that leaves open is decided in integers, lane by lane. A
+verdict by the rank of A alone may hold only by rounding: then the twist escapes from numbers within 64 eps.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ def _near_exact(
     """Least ``s_0 - |s_t|``, sum of s_0, and how far off the nearest exact internal force may be, for |s| = 1."""
     slack = np.min(np.where(known.live, s[..., 0] - np.linalg.norm(s[..., 1:], axis=-1), np.inf), -1)
     applied = np.linalg.norm(np.einsum("lij,lj->li", known.A, s.reshape(len(s), -1)), axis=-1)
-    shift = (applied + 2 * rounding) / np.where(sigma > 0, sigma, 1.0) * (1 + 8 * EPS)
+    shift = (applied + rounding) / np.where(sigma > 0, sigma, 1.0) * (1 + 8 * EPS)
     return slack, s[..., 0].sum(-1), np.where(sigma > 0, shift, np.inf)
 
 
