@@ -15,9 +15,8 @@ import numpy as np
 
 from .proof import REFUSED, Proof, refused
 from .reading import Malformed
-from .rebuilt import component_vectors
 
-__all__ = ["check", "force_claim", "prove", "proved_by"]
+__all__ = ["check", "prove", "proved_by"]
 
 
 @singledispatch
@@ -104,80 +103,3 @@ def _problem_shape(grasp, problem: SimpleNamespace) -> tuple[int, ...]:
     batch = grasp.position.shape[:-2]
     lead = np.shape(problem.wrench)[:-1] if problem.wrench is not None else ()
     return tuple(lead) if len(lead) > len(batch) else tuple(batch)
-
-
-def _spread(
-    value, own: tuple[int, ...], batch: tuple[int, ...], shape: tuple[int, ...], name: str
-) -> np.ndarray:
-    """``value`` with trailing axes ``own``, one for all, one a grasp or one a problem, spread over all problems."""
-    array = np.asarray(value, np.float64)
-    lead = array.shape[: array.ndim - len(own)]
-    if array.shape[array.ndim - len(own) :] == own:
-        loads = len(shape) - len(batch)
-        if len(lead) <= len(batch) and loads:
-            array = array.reshape(*lead, *([1] * loads), *own)
-        try:
-            return np.broadcast_to(array, (*shape, *own))
-        except ValueError:
-            pass
-    raise ValueError(f"{name} of shape {np.shape(value)} does not fit problems of shape {(*shape, *own)}")
-
-
-def _in_contact_axes(grasp, torque_limits) -> tuple[Any, Any]:
-    """(J, tau_max) for forces in contact axes; J in body or world axes is turned here, ``J_contact = B^T J``."""
-    axes = getattr(torque_limits, "axes", None)
-    if axes is None:
-        return torque_limits
-    jacobian, torque = np.asarray(torque_limits.jacobian, np.float64), torque_limits.torque
-    if axes == "contact":
-        return jacobian, torque
-    B = component_vectors(grasp, torque_limits.orientation if axes == "world" else None)
-    k, r, n = B.shape[-3:]
-    rows = jacobian.reshape(*jacobian.shape[:-2], k, r, jacobian.shape[-1])
-    turned = np.einsum("...krn,...krq->...knq", B, rows)
-    return turned.reshape(*turned.shape[:-3], k * n, turned.shape[-1]), torque
-
-
-def force_claim(grasp, answer, problem) -> SimpleNamespace:
-    """The forces of an answer beside the caller's problem, spread over all lanes: what ``check_forces`` reads."""
-    if problem.wrench is None or problem.criterion is None:
-        raise ValueError(
-            "forces are checked against the problem they answer: give wrench=.. and criterion=.., and max_normal=.., "
-            "torque_limits=.. where there were any"
-        )
-    shape, batch = np.shape(answer.status), grasp.position.shape[:-2]
-    k, m = grasp.position.shape[-2], 3 if grasp.position.shape[-1] == 2 else 6
-    wrench = _spread(problem.wrench, (m,), batch, shape, "wrench")
-    cap = limits = None
-    if problem.max_normal is not None:
-        value = np.asarray(problem.max_normal, np.float64)
-        cap = _spread(np.broadcast_to(value, (*value.shape[:-1], k)), (k,), batch, shape, "max_normal")
-    if problem.torque_limits is not None:
-        jacobian, torque = _in_contact_axes(grasp, problem.torque_limits)
-        rows, joints = np.shape(jacobian)[-2:]
-        torque = np.broadcast_to(torque, (*np.shape(torque)[:-1], joints))
-        limits = (
-            _spread(jacobian, (rows, joints), batch, shape, "J"),
-            _spread(torque, (joints,), batch, shape, "tau_max"),
-        )
-    criterion = problem.criterion
-    name = type(criterion).__name__
-    weights = {
-        key: _spread(getattr(criterion, key), (), batch, shape, f"the criterion's {key}")
-        for key in ("weight", "length")
-        if getattr(criterion, key, None) is not None
-    }
-    return SimpleNamespace(
-        status=answer.status,
-        force=answer.force,
-        cost=answer.upper,
-        bound=answer.lower,
-        escape_twist=answer.escape_twist,
-        load_twist=answer.load_twist,
-        joint_rates=answer.joint_rates,
-        smoothing=answer.smoothing,
-        wrench=wrench,
-        criterion=type(name, (), weights)(),
-        max_normal=cap,
-        torque_limits=limits,
-    )

@@ -17,7 +17,7 @@ import numpy as np
 
 from .rebuilt import Rebuilt
 
-__all__ = ["Asked", "Multipliers", "cost", "lower_bound", "robust_sensitivity"]
+__all__ = ["Asked", "Multipliers", "cost", "cost_change", "lower_bound", "robust_sensitivity"]
 
 
 class Asked(NamedTuple):
@@ -45,6 +45,10 @@ class Asked(NamedTuple):
         n, index = len(self.known.components), self.known.normal_index
         order = [index, *(j for j in range(n) if j != index)]
         return (self.jacobian * self.known.scale[..., None])[:, :, order]
+
+    def joint_work(self, rates: np.ndarray) -> np.ndarray:
+        """``sum_j |beta_j| tau_j`` (N,): infinite where a joint without a limit moves, nothing where it does not."""
+        return np.sum(np.where(rates == 0, 0.0, np.abs(rates) * self.torque), -1)
 
 
 class Multipliers(NamedTuple):
@@ -134,11 +138,33 @@ def robust_sensitivity(asked: Asked, s: np.ndarray) -> np.ndarray | float:
     return asked.weight * np.sum(np.where(counted, b * head / np.where(counted, head - tail, 1.0), 0.0), -1)
 
 
+def cost_change(asked: Asked, s: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """(N,) what the criterion may grow by where the scaled forces change by ``shift`` (N,) at most."""
+    known, name, weight = asked.known, asked.name, asked.weight
+    if name == "Gentlest":
+        return shift
+    if name == "SmallestSum":
+        return np.sqrt(known.live.sum(-1)) * shift
+    if name == "Robust":
+        assert weight is not None
+        a, b, _ = _log_det_terms(asked)
+        head = np.where(known.live, s[..., 0], 1.0)
+        gap = head - np.linalg.norm(s[..., 1:], axis=-1)
+        # Twice the derivative of a log f_n + b log((f_n - psi) (f_n + psi)), as long as the change is small beside both.
+        slope = a / head + np.where(b > 0, 2 * b / np.where(b > 0, gap, 1.0), 0.0)
+        slope = np.where(known.live, slope, 0.0)
+        small = (shift[:, None] <= np.where(known.live, np.where(b > 0, gap, head), np.inf) / 4).all(-1)
+        return np.where(small, shift + 2 * weight * slope.sum(-1) * shift, np.inf)
+    curve = np.where(known.live[..., None], _curvatures(asked), 0.0)
+    size = np.linalg.norm((curve * s).reshape(len(s), -1), axis=-1)
+    return 2 * size * shift + np.max(curve, (-1, -2)) * shift * shift
+
+
 def lower_bound(asked: Asked, multipliers: Multipliers, s: np.ndarray) -> np.ndarray:
     """What no admissible forces can undercut; s (N, k, n) near the optimum makes it close."""
     known, name, cap = asked.known, asked.name, asked.cap
     live, (y, rates, x) = known.live, multipliers
-    gain = np.sum(y * asked.load, -1) - np.sum(np.abs(rates) * asked.torque, -1)
+    gain = np.sum(y * asked.load, -1) - asked.joint_work(rates)
     tail = np.linalg.norm(x[..., 1:], axis=-1)
     rho = np.where(live, tail - x[..., 0], 0.0)
     if name in ("SmallestSum", "Gentlest"):

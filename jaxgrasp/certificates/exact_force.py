@@ -17,8 +17,9 @@ import numpy as np
 from .dyadic import ExactGrasp, ForceSet
 from .elimination import solve
 from .enclosures import root_above, root_below
+from .rebuilt import Rebuilt
 
-__all__ = ["Scaled", "internal_force", "margin_at_least"]
+__all__ = ["Scaled", "internal_force", "margin_at_least", "scaled_lane"]
 
 BITS = 60  # of a force when it becomes an integer
 STEPS, MORE_BITS = 2, 50  # corrections in floating point, each with so many bits more
@@ -36,6 +37,21 @@ class Scaled(NamedTuple):
     torsion: np.ndarray
     kinds: str
     length: float
+
+
+def scaled_lane(known: Rebuilt, lane: int, dimension: int) -> Scaled:
+    """Lane ``lane`` of the grasps."""
+    live = known.live[lane]
+    blocks = known.blocks[lane][live]
+    k, m, n = blocks.shape
+    kinds = "n" + "".join("s" if c == "tau_n" else "t" for c in known.components if c != "f_n")
+    return Scaled(
+        np.moveaxis(blocks, 0, 1).reshape(m, k * n),
+        np.swapaxes(blocks[:, :dimension], 1, 2),
+        known.torsion[lane][live] / known.length[lane],
+        kinds,
+        float(known.length[lane]),
+    )
 
 
 class _Parts:

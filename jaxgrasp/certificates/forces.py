@@ -1,17 +1,17 @@
 """Optimal forces and infeasible loads proved again (theory section 3).
 
 With the folded map A (lengths over L), the forces s (f = mu s, gamma s, s), the load w and x_i = A_i^T y + J_i beta for
-the twist y and the joint rates beta of the result:
+the twist y and the joint rates beta of the answer:
 
-    OPTIMAL     A s + w is rounding, s_0,i >= |s_t,i|, s_0,i <= cap_i, |J^T f| <= tau_max, all to rounding; the cost
-                is the criterion at f; the dual function at (y, beta), in closed form below, reaches the claimed
-                bound; and cost and bound are close
-    INFEASIBLE  y.w > sum_i min(cap_i, 1e6 |w|) (|x_t,i| - x_0,i)+ + sum_j |beta_j| tau_j: the load does more work along
-                y than any admissible forces (up to a million times the load) can take up
+    OPTIMAL     the forces given are admissible and balance the load, to rounding; exact forces next to them cost no
+                more than ``upper``, the dual function at (y, beta), in closed form, reaches ``lower``, and both are close
+    STALLED     the same of each end of the bracket that is finite
+    INFEASIBLE  the load does more work along the escape twist than admissible forces can take up (``separation``)
     INVALID     the numbers are indeed no problem
-    STALLED     claims nothing, so there is nothing to refute
 
-The dual functions are in ``criteria``.
+What may show as rounding depends on the problem alone: 256 eps of the dtype, of the cost's own terms. Where exact
+forces cannot be shown (the rank is not full, or there is no interior), the answer may hold to rounding: for a load so
+near that forces pulled onto their cones and limits balance it.
 """
 
 from __future__ import annotations
@@ -20,187 +20,204 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .criteria import Asked, Multipliers, cost, lower_bound, robust_sensitivity
+from .criteria import Asked, Multipliers, cost, cost_change, lower_bound, robust_sensitivity
+from .force_problem import ForceProblem, force_problem
+from .interior import edges_of, exact_forces
 from .proof import LEVELS, Proof
-from .rebuilt import EPS, ROUNDING, Rebuilt, rebuild, scaled_force, scaled_twist, scaled_wrench
+from .reading import Fields
+from .rebuilt import EPS, scaled_force, scaled_twist
+from .separation import prove_separation
 
-__all__ = ["check_forces", "prove_forces"]
+__all__ = ["prove_forces"]
 
 INVALID, OPTIMAL, INFEASIBLE, STALLED = 5, 6, 7, 8
-LIMIT = 1e6  # loads
-FINE = 256.0  # rounding, in units of eps of the grasp's dtype, that forces may show
+FINE = 256.0  # rounding, in units of eps of the grasp's dtype, that forces and costs may show
+ENDS = 4096.0  # eps of float64: what both ends of a bracket may lack
+NEARBY = 64.0  # eps: how far numbers may lie of which a proof to rounding speaks
 CLOSE = 1e-6  # relative gap that OPTIMAL may leave
 
 
-class Told(NamedTuple):
-    """What a result claims of N lanes: forces (N, k, n), twists (N, m), rates (N, q), the rest (N,)."""
+class Claim(NamedTuple):
+    """What N lanes say, forces in the problem's units: s (N, k, n), twists (N, m) over L, rates (N, q), the rest (N,)."""
 
-    force: np.ndarray
-    cost: np.ndarray
-    bound: np.ndarray
+    status: np.ndarray
+    s: np.ndarray
+    upper: np.ndarray
+    lower: np.ndarray
     load_twist: np.ndarray
     escape_twist: np.ndarray
     joint_rates: np.ndarray
 
 
-class Sizes(NamedTuple):
-    """What rounding is relative to (N,): of the forces, the load, A; and ``reach`` (N, q) of the torques."""
+class Shown(NamedTuple):
+    """What is proved of each lane (N,): a cost that exact forces reach, and one that none undercuts.
 
-    force: np.ndarray
-    load: np.ndarray
-    A: np.ndarray
-    reach: np.ndarray
+    distance  of the problem of which it is true, from the one given
+    moved     share of the largest force by which the exact forces differ
+    """
 
-
-def prove_forces(grasp, result, tolerance: float | None = None) -> Proof:
-    """What the evidence proves; shape of ``result.status``."""
-    accepted = np.asarray(check_forces(grasp, result, tolerance))
-    nan = np.full(accepted.shape, np.nan)
-    return Proof(
-        LEVELS[accepted.astype(int)], np.where(accepted, 0.0, np.inf), nan, nan, np.zeros(accepted.shape)
-    )
+    upper: np.ndarray
+    lower: np.ndarray
+    distance: np.ndarray
+    moved: np.ndarray
 
 
-def check_forces(grasp, result, tolerance: float | None = None) -> np.ndarray:
-    """True for each lane whose answer the evidence proves; shape of ``result.status``."""
-    shape = np.shape(result.status)
-    status = np.asarray(result.status).reshape(-1)
+def prove_forces(grasp, answer, problem, tolerance: float | None = None) -> Proof:
+    """What the evidence of ``answer`` proves of the problem; shapes (*batch, *loads)."""
     with np.errstate(all="ignore"):
-        asked = _asked(grasp, result)
-        told = _told(asked, result)
-        fine = FINE * float(np.finfo(np.dtype(grasp.position.dtype)).eps)
-        smoothing = getattr(result, "smoothing", 0.0) or 0.0
-        optimal = _optimal(asked, told, fine, CLOSE if tolerance is None else tolerance, smoothing)
-        infeasible = _infeasible(asked, told)
-    accepted = np.select(
-        [status == OPTIMAL, status == INFEASIBLE, status == STALLED, status == INVALID],
-        [asked.valid & optimal, asked.valid & infeasible, asked.valid, ~asked.valid],
-        default=False,
-    )
-    return accepted.reshape(shape)[()]
+        posed = force_problem(grasp, problem)
+        asked, claim = posed.asked, _claim(posed, answer)
+        eps = float(np.finfo(np.dtype(grasp.position.dtype)).eps)
+        smoothing = float(getattr(answer, "smoothing", 0.0) or 0.0)
+        level, shown = _held(posed, claim, eps, CLOSE if tolerance is None else tolerance, smoothing)
+        lost = asked.valid & (claim.status == INFEASIBLE) & (claim.lower == np.inf) & (claim.upper == np.inf)
+        lost &= (claim.s == 0).all((-1, -2))
+        out, off = prove_separation(
+            asked, posed.wrench, claim.escape_twist, claim.joint_rates, NEARBY * eps, lost
+        )
+        level, distance = np.where(lost, out, level), np.where(lost, off, shown.distance)
+        nothing = np.isnan(claim.lower) & np.isnan(claim.upper)
+        level = np.where(~asked.valid & (claim.status == INVALID) & nothing, 2, level)
+        unit = posed.cost_unit
+        known = (level > 0) & ~lost
+        lower = np.where(known, shown.lower * unit, np.where(level > 0, np.inf, np.nan))
+        upper = np.where(known, shown.upper * unit, np.where(level > 0, np.inf, np.nan))
+    distance = np.where(level == 2, 0.0, np.where(level == 1, distance, np.inf))
+    moved = np.where(known & (claim.status == OPTIMAL), shown.moved, 0.0)
+    return Proof(*(x.reshape(posed.shape) for x in (LEVELS[level], distance, lower, upper, moved)))
 
 
-def _asked(grasp, result) -> Asked:
-    """The problem, from the grasp and from what the result says was asked."""
-    shape, dimension, k = np.shape(result.status), grasp.position.shape[-1], grasp.position.shape[-2]
-    lanes = int(np.prod(shape))
-    known = _repeated(rebuild(grasp), lanes // max(int(np.prod(grasp.position.shape[:-2])), 1))
-    live, n = known.live, len(known.components)
-
-    def rows(array, *own):
-        return np.asarray(array, np.float64).reshape(lanes, *own)
-
-    wrench = rows(result.wrench, 3 if dimension == 2 else 6)
-    cap = np.full((lanes, k), np.inf) if result.max_normal is None else rows(result.max_normal, k)
-    valid = known.valid & np.isfinite(wrench).all(-1) & ((cap > 0) | ~live).all(-1)
-    parameters = {name: getattr(result.criterion, name, None) for name in ("weight", "length")}
-    for name, value in parameters.items():
-        if value is not None:
-            value = rows(np.broadcast_to(value, shape))
-            valid &= np.isfinite(value) & (value > 0)
-            parameters[name] = value
-    jacobian, torque = np.zeros((lanes, k, n, 0)), np.zeros((lanes, 0))
-    if result.torque_limits is not None:
-        jacobian = rows(result.torque_limits[0], k, n, np.shape(result.torque_limits[0])[-1])
-        torque = rows(result.torque_limits[1], jacobian.shape[-1])
-        valid &= np.isfinite(torque).all(-1) & (torque > 0).all(-1)
-        valid &= (np.isfinite(jacobian).all((-1, -2)) | ~live).all(-1)
-        jacobian = np.where(live[..., None, None], jacobian, 0.0)
-    return Asked(
-        known=known,
-        name=type(result.criterion).__name__,
-        cap=np.where(live, cap, np.inf),
-        jacobian=jacobian,
-        torque=torque,
-        load=scaled_wrench(wrench, known.length, dimension),
-        valid=valid,
-        dimension=dimension,
-        **parameters,
+def _claim(posed: ForceProblem, answer) -> Claim:
+    asked, said = posed.asked, Fields(answer, posed.shape)
+    k, n = asked.known.scale.shape[1:]
+    m, q = asked.load.shape[-1], asked.torque.shape[-1]
+    force = said.numbers("force", k * n).reshape(-1, k, n) / posed.unit[:, None, None]
+    force = np.where(asked.known.live[..., None], force, 0.0)
+    # A squared cost has multipliers in units of force, the others have none.
+    back = np.where(posed.cost_unit == posed.unit, 1.0, posed.unit)[:, None]
+    length = asked.known.length
+    return Claim(
+        said.numbers("status"),
+        scaled_force(force, asked.known.scale, asked.known.normal_index),
+        said.numbers("upper") / posed.cost_unit,
+        said.numbers("lower") / posed.cost_unit,
+        scaled_twist(said.numbers("load_twist", m), length, asked.dimension) / back,
+        scaled_twist(said.numbers("escape_twist", m), length, asked.dimension),
+        said.numbers("joint_rates", q) / back,
     )
 
 
-def _repeated(known: Rebuilt, loads: int) -> Rebuilt:
-    """Each grasp once for each of its loads."""
-    if loads == 1:
-        return known
-    arrays = {name: x for name, x in known._asdict().items() if isinstance(x, np.ndarray)}
-    return known._replace(**{name: np.repeat(x, loads, axis=0) for name, x in arrays.items()})
+def _held(
+    posed: ForceProblem, claim: Claim, eps: float, tolerance: float, smoothing: float
+) -> tuple[np.ndarray, Shown]:
+    """Levels of OPTIMAL and STALLED lanes, and what is proved of their cost."""
+    asked, fine = posed.asked, FINE * eps
+    value, size = cost(asked, claim.s)
+    size = np.maximum(size, np.abs(value))
+    blur = fine * (size + robust_sensitivity(asked, claim.s))
+    room = np.maximum(blur, ENDS * EPS * size)
+    limits = 3 * claim.s.shape[1] + 2 * asked.torque.shape[-1]
+    allowed = np.maximum(tolerance * size, 4 * (smoothing / posed.cost_unit) * limits) + 4 * room
+    ordered = asked.valid & (claim.lower <= claim.upper)
+    said = np.abs(value - claim.upper) <= blur
 
+    def fits(shown: Shown) -> np.ndarray:
+        cheap = said & np.isfinite(shown.upper)
+        dear = claim.lower <= shown.lower + room
+        width = np.maximum(claim.upper, shown.upper) - np.minimum(claim.lower, shown.lower)
+        optimal = (claim.status == OPTIMAL) & cheap & dear & (width <= allowed)
+        stalled = (claim.status == STALLED) & (dear | (claim.lower == -np.inf))
+        return ordered & (optimal | (stalled & (cheap | (claim.upper == np.inf))))
 
-def _told(asked: Asked, result) -> Told:
-    live, m, q = asked.known.live, asked.load.shape[-1], asked.torque.shape[-1]
-    lanes, k, n = *live.shape, len(asked.known.components)
-
-    def rows(array, *own):
-        return np.asarray(array, np.float64).reshape(lanes, *own)
-
-    force = np.where(live[..., None], rows(result.force, k, n), 0.0)
-    twists = rows(result.load_twist, m), rows(result.escape_twist, m)
-    return Told(force, rows(result.cost), rows(result.bound), *twists, rows(result.joint_rates, q))
-
-
-def _multipliers(asked: Asked, twist: np.ndarray, rates: np.ndarray) -> Multipliers:
-    y = scaled_twist(twist, asked.known.length, asked.dimension)
-    x = np.einsum("lkij,li->lkj", asked.known.blocks, y)
-    return Multipliers(y, rates, x + np.einsum("lkcj,lj->lkc", asked.scaled_jacobian(), rates))
-
-
-def _optimal(asked: Asked, told: Told, fine: float, tolerance: float, smoothing: float) -> np.ndarray:
-    """The forces are admissible and balanced, at the stated cost, which the bound nearly reaches."""
-    s = scaled_force(told.force, asked.known.scale, asked.known.normal_index)
-    total = np.linalg.norm(s.reshape(len(s), -1), axis=-1)
-    sizes = Sizes(
-        total,
-        np.linalg.norm(asked.load, axis=-1),
-        np.linalg.norm(asked.known.A, axis=(-2, -1)),
-        np.linalg.norm(asked.scaled_jacobian(), axis=(1, 2)) * total[:, None],
-    )
-    value, scale = cost(asked, s)
-    multipliers = _multipliers(asked, told.load_twist, told.joint_rates)
-    best = lower_bound(asked, multipliers, s)
+    exactly, nearly = _shown(asked, claim, eps)
     # No forces for no load: nothing is cheaper than 0.
-    best = np.where((total == 0) & (sizes.load == 0) & (asked.weight is None), 0.0, best)
-    # What evaluating a bound from large multipliers can lose to rounding.
-    power = np.linalg.norm(multipliers.y, axis=-1) * (sizes.load + sizes.A * total)
-    power = power + np.sum(np.abs(told.joint_rates) * (asked.torque + sizes.reach), -1)
-    relative = np.maximum(scale, np.abs(value))
-    room = fine * relative
-    allowed = tolerance * relative + room
-    allowed = np.maximum(allowed, 4 * smoothing * (3 * s.shape[1] + 2 * asked.torque.shape[-1]))
+    rest = ~claim.s.any((-1, -2)) & ~asked.load.any(-1) & (asked.weight is None)
+    exactly = Shown(*(np.where(rest, 0.0, x) for x in exactly))
+    first, second = fits(exactly), fits(nearly)
+    level = np.where(first, 2, np.where(second, 1, 0))
+    return level, Shown(*(np.where(first, x, z) for x, z in zip(exactly, nearly, strict=True)))
+
+
+def _shown(asked: Asked, claim: Claim, eps: float) -> tuple[Shown, Shown]:
+    """What is proved of the problem itself, and of one within rounding."""
+    given = _admissible(asked, claim.s, FINE * eps)
+    exact = exact_forces(asked, claim.s, FINE * eps)
+    near, distance = _pulled_in(asked, claim.s, exact.s)
+    nothing = np.zeros(len(near))
     return (
-        _admissible(asked, told.force, s, sizes, fine)
-        & (np.abs(value - told.cost) <= room + fine * robust_sensitivity(asked, s))
-        & (told.bound <= best + room + fine * power)
-        & (value - np.minimum(best, told.bound) <= allowed + room + fine * power)
+        _of_forces(asked, claim, exact.s, exact.shift, given & exact.shown, nothing),
+        _of_forces(asked, claim, near, nothing, given & (distance <= NEARBY * eps), distance),
     )
 
 
-def _admissible(asked: Asked, force: np.ndarray, s: np.ndarray, sizes: Sizes, fine: float) -> np.ndarray:
-    """``A s + w = 0``, ``s_0 >= |s_t|``, ``s_0 <= cap``, ``|J^T f| <= tau``, all to rounding."""
-    live, edge = asked.known.live, fine * sizes.force[:, None]
+def _of_forces(
+    asked: Asked, claim: Claim, s: np.ndarray, shift: np.ndarray, admissible: np.ndarray, distance: np.ndarray
+) -> Shown:
+    """The cost of forces within ``shift`` of s, rounded up, and the bound of the multipliers, rounded down."""
+    value, size = cost(asked, s)
+    change = cost_change(asked, s, np.where(admissible, shift, 0.0))
+    top = value + change + 4 * (s.shape[1] * s.shape[2] + 8) * EPS * np.maximum(size, np.abs(value))
+    largest = np.max(np.abs(claim.s), (-1, -2), initial=0.0)
+    moved = np.max(np.abs(s - claim.s), (-1, -2), initial=0.0) + np.where(admissible, shift, 0.0)
+    return Shown(
+        np.where(admissible, top, np.inf),
+        _proved_bound(asked, claim, s),
+        distance,
+        moved / np.where(largest > 0, largest, 1.0),
+    )
+
+
+def _admissible(asked: Asked, s: np.ndarray, fine: float) -> np.ndarray:
+    """The forces as given: ``A s + w = 0`` and inside all limits, to rounding."""
+    total = np.linalg.norm(s.reshape(len(s), -1), axis=-1)
     applied = np.einsum("lij,lj->li", asked.known.A, s.reshape(len(s), -1))
-    residual = np.linalg.norm(applied + asked.load, axis=-1)
-    tails = np.linalg.norm(s[..., 1:], axis=-1)
-    torques = np.einsum("lkcj,lkc->lj", asked.jacobian, force)
+    size = np.linalg.norm(asked.known.A, axis=(-2, -1)) * total + np.linalg.norm(asked.load, axis=-1)
+    rooms, edge = edges_of(asked, s), fine * total[:, None]
+    reach = np.linalg.norm(asked.scaled_jacobian(), axis=(1, 2)) * total[:, None]
     return (
-        (residual <= fine * (sizes.A * sizes.force + sizes.load))
-        & (np.where(live, s[..., 0] - tails, 0.0) >= -edge).all(-1)
-        & (np.where(live, s[..., 0] - asked.cap, -np.inf) <= edge).all(-1)
-        & (np.abs(torques) <= asked.torque + fine * (sizes.reach + asked.torque)).all(-1)
+        (np.linalg.norm(applied + asked.load, axis=-1) <= fine * size)
+        & (rooms.cone >= -edge).all(-1)
+        & (rooms.cap >= -edge).all(-1)
+        & (rooms.torque >= -fine * (reach + np.where(np.isfinite(asked.torque), asked.torque, 0.0))).all(-1)
     )
 
 
-def _infeasible(asked: Asked, told: Told) -> np.ndarray:
-    """The load does more work along the twist than any admissible forces can take up."""
-    known, jacobian = asked.known, asked.scaled_jacobian()
-    # A proof may be scaled by any positive number: to size 1, so that nothing overflows.
-    largest = np.max(np.abs(np.concatenate([told.escape_twist, told.joint_rates], -1)), -1, keepdims=True)
-    xi, rates, x = _multipliers(asked, told.escape_twist / largest, told.joint_rates / largest)
-    speed, size = np.linalg.norm(xi, axis=-1), np.linalg.norm(asked.load, axis=-1)
-    blur = np.linalg.norm(known.blocks, axis=(-2, -1)) * speed[:, None]
+def _pulled_in(asked: Asked, given: np.ndarray, balanced: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Forces pulled onto their cones and caps, and how far the load lies that they balance, over its size.
+
+    Of the forces as given and of those balanced again, the nearer.
+    """
+    best, least = given, np.full(len(given), np.inf)
+    for s in (given, balanced):
+        tail = np.linalg.norm(s[..., 1:], axis=-1)
+        head = np.clip(s[..., 0], 0.0, asked.cap)
+        shrink = np.minimum(1.0, head / np.where(tail > 0, tail, 1.0))
+        s = np.concatenate([head[..., None], s[..., 1:] * shrink[..., None]], -1)
+        total = np.linalg.norm(s.reshape(len(s), -1), axis=-1)
+        size = np.linalg.norm(asked.known.A, axis=(-2, -1)) * total + np.linalg.norm(asked.load, axis=-1)
+        applied = np.einsum("lij,lj->li", asked.known.A, s.reshape(len(s), -1)) + asked.load
+        off = np.linalg.norm(applied, axis=-1) / np.where(size > 0, size, 1.0)
+        over = np.maximum(-edges_of(asked, s).torque, 0.0) / np.where(asked.torque > 0, asked.torque, 1.0)
+        distance = np.maximum(off, np.max(over, -1, initial=0.0)) + 2 * EPS
+        better = distance < least
+        best, least = np.where(better[:, None, None], s, best), np.where(better, distance, least)
+    return best, least
+
+
+def _proved_bound(asked: Asked, claim: Claim, s: np.ndarray) -> np.ndarray:
+    """A lower bound of the optimal cost: the dual function at x_i smaller by what rounding can do to it.
+
+    The dual function grows with x in the order of the (self-dual) cones.
+    """
+    y, rates, known, jacobian = claim.load_twist, claim.joint_rates, asked.known, asked.scaled_jacobian()
+    k, n, joints = jacobian.shape[1:]
+    x = np.einsum("lkij,li->lkj", known.blocks, y) + np.einsum("lkcj,lj->lkc", jacobian, rates)
+    blur = np.linalg.norm(known.blocks, axis=(-2, -1)) * np.linalg.norm(y, axis=-1)[:, None]
     blur = blur + np.linalg.norm(jacobian, axis=(-2, -1)) * np.linalg.norm(rates, axis=-1)[:, None]
-    violation = np.linalg.norm(x[..., 1:], axis=-1) - x[..., 0] + ROUNDING * EPS * blur
-    most = np.minimum(asked.cap, LIMIT * size[:, None])
-    taken = np.sum(np.where(known.live, np.maximum(violation, 0.0) * most, 0.0), -1)
-    taken = taken + np.abs(rates * asked.torque).sum(-1)
-    return np.sum(xi * asked.load, -1) - ROUNDING * EPS * speed * size > taken
+    x[..., 0] -= (24 + n + joints) * EPS * blur
+    best = lower_bound(asked, Multipliers(y, rates, x), s)
+    work = np.linalg.norm(y, axis=-1) * np.linalg.norm(asked.load, axis=-1) + asked.joint_work(rates)
+    _, size = cost(asked, s)
+    error = 16 * EPS * work + 4 * (k * n + 8) * EPS * (size + np.abs(best) + work)
+    floor = 0.0 if asked.weight is None else -np.inf  # no cost but the robust one is negative
+    return np.fmax(best - error, floor)

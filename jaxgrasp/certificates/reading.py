@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 __all__ = ["Fields", "Malformed"]
@@ -26,7 +28,7 @@ class Fields:
         real = array.dtype.kind in "fiu" or (array.dtype.kind == "V" and array.dtype.name == "bfloat16")
         if not real or array.shape != (*self.batch, *own):
             raise Malformed(name)
-        return array.astype(np.float64).reshape(-1, *own)
+        return array.astype(np.float64).reshape(math.prod(self.batch), *own)
 
     def truths(self, name: str) -> np.ndarray:
         """(N,) bool."""

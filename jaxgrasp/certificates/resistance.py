@@ -24,7 +24,7 @@ import numpy as np
 from .dyadic import exact_grasp
 from .elimination import independent
 from .enclosures import DIGITS
-from .exact_force import Scaled, internal_force, margin_at_least
+from .exact_force import internal_force, margin_at_least, scaled_lane
 from .exact_twist import escape_twist, margin_at_most, moves_all_alike, rounding_distance
 from .proof import LEVELS, Proof
 from .rank import numeric_rank_fits, rounding_of, smallest_singular_value
@@ -215,14 +215,7 @@ class _Lane:
         self.grasp = exact_grasp(
             known.position[lane][live], known.normal[lane][live], self.friction, known.torsion[lane][live]
         )
-        blocks = known.blocks[lane][live]  # (k, m, n)
-        k, m, n = blocks.shape
-        kinds = "n" + "".join("s" if c == "tau_n" else "t" for c in known.components if c != "f_n")
-        directions = np.swapaxes(blocks[:, :dimension], 1, 2)
-        gamma = known.torsion[lane][live] / known.length[lane]
-        self.scaled = Scaled(
-            np.moveaxis(blocks, 0, 1).reshape(m, k * n), directions, gamma, kinds, float(known.length[lane])
-        )
+        self.scaled = scaled_lane(known, lane, dimension)
         self.s = claim.s[lane][live]
 
     def proved(self, verdict: bool, at_least: bool, at_most: bool) -> tuple[int, float]:

@@ -18,7 +18,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from ..backend import Sweeps, batched, in_chunks, in_sweeps, is_traced, tile_width, to_lanes, to_rows
-from ..certificates import Proof, force_claim, prove_forces, proved_by
+from ..certificates import prove_forces, proved_by
 from ..conic import ConvexState, begin_convex_cone_program, regular, solve_convex_cone_program
 from ..contacts import Component, Grasp, TorqueLimits, tile_of, to_twist
 from ..core import (
@@ -49,11 +49,7 @@ TOTAL_BUDGET = 60
 CHUNK = 4096  # problems an executable takes at once when called on concrete arrays
 
 
-def _prove(grasp: Grasp, answer: OptimalForces, problem: Any, tolerance: float | None) -> Proof:
-    return prove_forces(grasp, force_claim(grasp, answer, problem), tolerance)
-
-
-@proved_by(_prove)
+@proved_by(prove_forces)
 class OptimalForces(Answer):
     """Optimal contact forces and their proofs, with the batch axes in front; forces in N, torques in N m.
 

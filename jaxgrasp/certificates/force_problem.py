@@ -1,0 +1,148 @@
+"""The caller's force problem, spread over all lanes, in float64; numpy only.
+
+Every lane is measured in its own unit of force, a power of two near the load, so that nothing over- or underflows.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .criteria import Asked
+from .rebuilt import Rebuilt, component_vectors, rebuild, scaled_wrench
+
+__all__ = ["ForceProblem", "force_problem"]
+
+SQUARED = ("SumOfSquares", "LeastNorm")
+
+
+class ForceProblem(NamedTuple):
+    """asked: the problem in units of ``unit`` (N,) newtons; shape: axes of the grasps and their loads; wrench (N, m)."""
+
+    asked: Asked
+    wrench: np.ndarray
+    unit: np.ndarray
+    shape: tuple[int, ...]
+
+    @property
+    def cost_unit(self) -> np.ndarray:
+        """(N,) of the criterion."""
+        return self.unit * self.unit if self.asked.name in SQUARED else self.unit
+
+
+def _shape(batch: tuple[int, ...], wrench: np.ndarray) -> tuple[int, ...]:
+    """Axes of the problem: the grasps', then any of the loads."""
+    lead = wrench.shape[:-1]
+    if not lead:
+        return batch
+    if len(lead) < len(batch) or any(a not in (1, b) for a, b in zip(lead, batch, strict=False)):
+        raise ValueError(f"wrench of shape {wrench.shape} does not fit grasps of shape {batch}")
+    return (*batch, *lead[len(batch) :])
+
+
+def _spread(
+    value: Any, own: tuple[int, ...], batch: tuple[int, ...], shape: tuple[int, ...], name: str
+) -> np.ndarray:
+    """``value`` with trailing axes ``own``, one for all, one a grasp or one a problem, for all problems (N, *own)."""
+    array = np.asarray(value, np.float64)
+    lead = array.shape[: array.ndim - len(own)]
+    if array.shape[array.ndim - len(own) :] == own:
+        loads = len(shape) - len(batch)
+        if len(lead) <= len(batch) and loads:
+            array = array.reshape(*lead, *([1] * loads), *own)
+        try:
+            return np.broadcast_to(array, (*shape, *own)).reshape(-1, *own)
+        except ValueError:
+            pass
+    raise ValueError(f"{name} of shape {np.shape(value)} does not fit problems of shape {(*shape, *own)}")
+
+
+def _in_contact_axes(grasp, torque_limits) -> tuple[Any, Any]:
+    """(J, tau_max) for forces in contact axes; J in body or world axes is turned here, ``J_contact = B^T J``."""
+    axes = getattr(torque_limits, "axes", None)
+    if axes is None:
+        return torque_limits
+    jacobian, torque = np.asarray(torque_limits.jacobian, np.float64), torque_limits.torque
+    if axes == "contact":
+        return jacobian, torque
+    B = component_vectors(grasp, torque_limits.orientation if axes == "world" else None)
+    k, r, n = B.shape[-3:]
+    rows = jacobian.reshape(*jacobian.shape[:-2], k, r, jacobian.shape[-1])
+    turned = np.einsum("...krn,...krq->...knq", B, rows)
+    return turned.reshape(*turned.shape[:-3], k * n, turned.shape[-1]), torque
+
+
+def _repeated(known: Rebuilt, loads: int) -> Rebuilt:
+    """Each grasp once for each of its loads."""
+    if loads == 1:
+        return known
+    arrays = {name: x for name, x in known._asdict().items() if isinstance(x, np.ndarray)}
+    return known._replace(**{name: np.repeat(x, loads, axis=0) for name, x in arrays.items()})
+
+
+def _power_of_two(size: np.ndarray) -> np.ndarray:
+    """Near ``size``; 1 where it is no size."""
+    usable = np.isfinite(size) & (size > 0)
+    return np.exp2(np.floor(np.log2(np.where(usable, size, 1.0))))
+
+
+def force_problem(grasp, problem) -> ForceProblem:
+    """The problem that ``optimize_forces`` was asked; ValueError where it is none, or does not fit the grasp."""
+    if problem.wrench is None or problem.criterion is None:
+        raise ValueError(
+            "forces are checked against the problem they answer: give wrench=.. and criterion=.., and max_normal=.., "
+            "torque_limits=.. where there were any"
+        )
+    batch, k, dimension = grasp.position.shape[:-2], grasp.position.shape[-2], grasp.position.shape[-1]
+    wrench = np.asarray(problem.wrench, np.float64)
+    if wrench.shape[-1:] != (3 if dimension == 2 else 6,):
+        raise ValueError(f"wrench of shape {wrench.shape} does not fit a body in {dimension} dimensions")
+    shape = _shape(batch, wrench)
+    wrench = _spread(wrench, wrench.shape[-1:], batch, shape, "wrench")
+    known = rebuild(grasp)
+    known = _repeated(known, len(wrench) // max(len(known.valid), 1))
+    live, n = known.live, len(known.components)
+    valid = known.valid & np.isfinite(wrench).all(-1)
+
+    cap = np.full(live.shape, np.inf)
+    if problem.max_normal is not None:
+        value = np.asarray(problem.max_normal, np.float64)
+        cap = _spread(np.broadcast_to(value, (*value.shape[:-1], k)), (k,), batch, shape, "max_normal")
+        valid &= ((cap > 0) | ~live).all(-1)
+    jacobian, torque = np.zeros((len(live), k, n, 0)), np.zeros((len(live), 0))
+    if problem.torque_limits is not None:
+        J, tau = _in_contact_axes(grasp, problem.torque_limits)
+        joints = np.shape(J)[-1]
+        tau = np.broadcast_to(tau, (*np.shape(tau)[:-1], joints))
+        jacobian = _spread(J, (k * n, joints), batch, shape, "J").reshape(-1, k, n, joints)
+        torque = _spread(tau, (joints,), batch, shape, "tau_max")
+        valid &= (torque > 0).all(-1) & (np.isfinite(jacobian).all((-1, -2)) | ~live).all(-1)
+        jacobian = np.where(live[..., None, None], jacobian, 0.0)
+    parameters: dict[str, np.ndarray | None] = {"weight": None, "length": None}
+    for name in parameters:
+        given = getattr(problem.criterion, name, None)
+        if given is not None:
+            value = _spread(given, (), batch, shape, f"the criterion's {name}")
+            valid &= np.isfinite(value) & (value > 0)
+            parameters[name] = value
+
+    with np.errstate(all="ignore"):
+        load = scaled_wrench(wrench, known.length, dimension)
+        weight = parameters["weight"]
+        unit = _power_of_two(np.max(np.abs(load), -1, initial=0.0))
+        if weight is not None:  # a barrier's logarithms are those of newtons
+            unit = np.ones_like(unit)
+        asked = Asked(
+            known=known,
+            name=type(problem.criterion).__name__,
+            weight=None if weight is None else weight / unit,
+            length=parameters["length"],
+            cap=np.where(live, cap / unit[:, None], np.inf),
+            jacobian=jacobian,
+            torque=torque / unit[:, None],
+            load=np.where(valid[:, None], load / unit[:, None], 0.0),
+            valid=valid,
+            dimension=dimension,
+        )
+    return ForceProblem(asked, wrench, unit, shape)
