@@ -218,6 +218,6 @@ def _proved_bound(asked: Asked, claim: Claim, s: np.ndarray) -> np.ndarray:
     best = lower_bound(asked, Multipliers(y, rates, x), s)
     work = np.linalg.norm(y, axis=-1) * np.linalg.norm(asked.load, axis=-1) + asked.joint_work(rates)
     _, size = cost(asked, s)
-    error = 16 * EPS * work + 4 * (k * n + 8) * EPS * (size + np.abs(best) + work)
+    error = (16 + joints) * EPS * work + 4 * (k * n + 8) * EPS * (size + np.abs(best))
     floor = 0.0 if asked.weight is None else -np.inf  # no cost but the robust one is negative
     return np.fmax(best - error, floor)

@@ -6,6 +6,7 @@ Nothing is claimed that was not proven: the cost and its bound (``bounds``), or 
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -24,7 +25,7 @@ from ..conic import (
     rmatvec,
     vector_norm,
 )
-from ..contacts import to_body, to_twist, unfold
+from ..contacts import Folded, to_body, to_twist, unfold
 from ..core import Array, Status, edge_tolerance, first_of, proven_limit, unit_roundoff
 from .bounds import criterion_value, dual_value
 from .infeasibility import proven_separation
@@ -48,13 +49,12 @@ class Answer(NamedTuple):
 class Values(NamedTuple):
     """A criterion between its bound and its cost (L,), in the caller's units.
 
-    scale  the objective, what the gap is relative to      rounding   what evaluating the bound can lose
+    bound  without what rounding can do to it      scale   the objective, what the gap is relative to
     """
 
     cost: Array
     bound: Array
     scale: Array
-    rounding: Array
 
 
 class Proofs(NamedTuple):
@@ -112,7 +112,7 @@ def _status(
     lanes: Lanes, values: Values, proofs: Proofs, violation: Array, smoothing: Array | None,
     tolerance: Array, edge: float,
 ) -> Array:  # fmt: skip
-    cost, bound = values.cost, values.bound - values.rounding
+    cost, bound = values.cost, values.bound
     tight = (cost - bound) <= tolerance * jnp.maximum(values.scale, jnp.abs(cost))
     if smoothing is not None:  # the answer is a point of the central path, at a gap of its own
         tight = lanes.stop == Status.CONVERGED.value
@@ -137,9 +137,8 @@ def answer(problem: ForceProblem, state: ConvexState, tolerance: Array) -> Answe
     m, dtype = program.rhs.shape[0], problem.tile.folded.norm.dtype
     u = _polished(projection.basis.columns, program.rhs, program.exists, state.point.u)
     rows, ray = _all_rows(state.point), _to_size_one(state.ray)
-    values = _values(problem, state.point, u, rows)
-
     found = Multipliers(rows, ray, to_twist(projection, rows[:m]), to_twist(projection, ray[:m]))
+    values = _values(problem, state.point, u, found)
     load = load._replace(rest=load.rest & (problem.demand.criterion.barrier_weight is None))
     status = _status(
         Lanes(problem.valid, load.off, load.rest, state.stop),
@@ -153,12 +152,13 @@ def answer(problem: ForceProblem, state: ConvexState, tolerance: Array) -> Answe
     return _in_user_units(problem._replace(load=load), status, u, values, found)
 
 
-def _values(problem: ForceProblem, point: ConvexPoint, u: Cone, rows: Array) -> Values:
+def _values(problem: ForceProblem, point: ConvexPoint, u: Cone, found: Multipliers) -> Values:
     program, size, barrier = problem.program, problem.load.size, problem.demand.barrier()
     cost = criterion_value(program, u, size, barrier)
-    bound = dual_value(program, rows, u, size, barrier)
+    bound = dual_value(program, found.rows, u, size, barrier)
     bound = jnp.where(jnp.isnan(bound), -jnp.inf, bound)
-    return Values(cost, bound, _scale(program, point, size), _rounding(program, rows, u, size))
+    rounding = _rounding(problem.tile.folded, program, found.twist, found.rows, u, problem.load)
+    return Values(cost, bound - rounding, _scale(program, point, size))
 
 
 def _proofs(problem: ForceProblem, found: Multipliers) -> Proofs:
@@ -182,12 +182,22 @@ def _to_size_one(ray: Array) -> Array:
 
 
 @stage
-def _rounding(program: ConvexConeProgram, rows: Array, u: Cone, size: Array) -> Array:
-    """What rounding can do to the bound of multipliers as large as ``rows``."""
+def _rounding(folded: Folded, program: ConvexConeProgram, twist: Array, rows: Array, u: Cone, load: Load) -> Array:
+    """What rounding can do to the bound of these multipliers, evaluated again from the twist of A as it is given."""
+    m, joints = program.rhs.shape[0], rows.shape[0] - program.rhs.shape[0]
     forces = jnp.sqrt(cone_sum(program.exists * inner(u, u)))
-    blur = vector_norm(rows) * (vector_norm(program.rhs) + forces) * size
-    blur = jnp.asarray(8 * unit_roundoff(blur.dtype), blur.dtype) * blur
-    return blur * size if program.curvature is not None else blur
+    blur = folded.norm * vector_norm(twist) * forces * load.size + vector_norm(twist) * vector_norm(load.wrench)
+    if joints:
+        beta = vector_norm(rows[m:])
+        square = [cone_sum(program.exists * inner(c, c)) for c in _joint_columns(program, m)]
+        blur = blur + beta * jnp.sqrt(reduce(jnp.add, square)) * forces * load.size
+    blur = jnp.asarray((32 + len(u) + joints) * unit_roundoff(blur.dtype), blur.dtype) * blur
+    return blur * load.size if program.curvature is not None else blur
+
+
+def _joint_columns(program: ConvexConeProgram, m: int) -> list[Cone]:
+    """The rows of E, one a joint."""
+    return [tuple(c[j] for c in program.columns) for j in range(m, program.columns[0].shape[0])]
 
 
 @stage
