@@ -1,116 +1,172 @@
 """Both bounds of the Ferrari-Canny quality proved again.
 
-    lower   every vertex is the wrench of forces in their cones with unit effort. Every ridge belongs to two facets and
-            one ray from the origin meets an odd number of facets: so every ray meets one, since that parity does not
-            change where a closed surface is crossed by a moving ray. No facet's plane is nearer than ``lower``.
-    upper   h(direction), in closed form, is no larger
+    lower          every vertex is the wrench of forces in their cones with unit effort, and the facets surround a ball of
+                   that radius (``polytope``); so the grasp is RESISTANT if it is positive
+    upper          h(direction), in closed form, is no larger
+    NOT_RESISTANT  both bounds are 0, and ``direction`` is the negative of a twist that no contact can oppose
+    touching       forces in their cones with unit effort at most
 
-A facet's plane {p : a . p = 1} has a = P^-1 1 from its corners P, at distance 1 / |a|. Neither convexity nor the way
-the polytope was found plays a part.
+Both bounds are proved to 1e-9 of epsilon (64 eps of float32); the proof states its own, rounded outwards.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
+from .dyadic import exact_grasp
+from .exact_force import scaled_lane
+from .exact_twist import escape_twist, rounding_distance
+from .polytope import ball_inside
 from .proof import LEVELS, Proof
-from .rebuilt import Rebuilt, rebuild, scaled_force
+from .reading import Fields, Malformed
+from .rebuilt import EPS, Rebuilt, rebuild, scaled_force
 
-__all__ = ["check_epsilon", "prove_epsilon"]
+__all__ = ["prove_epsilon"]
 
-RESISTANT, INVALID = 1, 5
-ROUNDING = 1e-9  # of epsilon; of unit effort
-
-
-def _wrenches(
-    known: Rebuilt, lane: int, forces: np.ndarray, row_scale: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Wrenches (V, m) of forces (V, k, n), lengths over the torque scale, and the forces scaled, normal first."""
-    s = scaled_force(forces, known.scale[lane], known.normal_index)
-    return np.einsum("kmn,vkn->vm", known.blocks[lane], s) * row_scale, s
+RESISTANT, NOT_RESISTANT, MARGINAL, UNDECIDED, INVALID = 1, 2, 3, 4, 5
+NORMS = ("L1", "Linf")
+ROOM = 1e-9  # of epsilon; of unit effort
+NEARBY = 64.0  # eps
+NEARLY_NOTHING = 1e-3  # of |A|: what epsilon may be where the margin is 0
 
 
-def _surrounds(points: np.ndarray, facets: np.ndarray, lower: float) -> bool:
-    """Whether the simplices surround the ball of radius ``lower`` about the origin."""
-    m = points.shape[1]
-    if len(facets) <= m or facets.min() < 0 or facets.max() >= len(points):
-        return False
-    sorted_corners = np.sort(facets, axis=1)
-    if (np.diff(sorted_corners, axis=1) == 0).any():
-        return False
-    ridges = np.concatenate([np.delete(sorted_corners, j, axis=1) for j in range(m)])
-    _, counts = np.unique(ridges, axis=0, return_counts=True)
-    if (counts != 2).any():
-        return False
-    corners = points[facets]
-    try:
-        polar = np.linalg.solve(corners, np.ones((len(facets), m, 1)))[..., 0]
-        ray = np.random.default_rng(0).normal(size=m)
-        share = np.linalg.solve(
-            np.swapaxes(corners, 1, 2), np.broadcast_to(ray[:, None], (len(facets), m, 1))
-        )
-    except np.linalg.LinAlgError:
-        return False
-    met = (share[..., 0] >= 0).all(axis=1)
-    distance = 1 / np.linalg.norm(polar, axis=1)
-    return bool(np.isfinite(distance).all() and distance.min() >= lower and met.sum() % 2 == 1)
+class Claim(NamedTuple):
+    """What N lanes say, lengths as given: scalars (N,), direction (N, m), forces (N, V, k, n), facets (N, F, m)."""
+
+    status: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    scale: np.ndarray
+    direction: np.ndarray
+    touching: np.ndarray
+    forces: np.ndarray
+    facets: np.ndarray
+    norm: str
 
 
-def _support(known: Rebuilt, lane: int, direction: np.ndarray, row_scale: np.ndarray, norm: str) -> float:
-    v = np.einsum("kmn,m->kn", known.blocks[lane], direction * row_scale)
-    h = np.where(known.live[lane], v[:, 0] + np.linalg.norm(v[:, 1:], axis=-1), 0.0)
-    return float(np.maximum(h, 0.0).sum() if norm == "Linf" else max(h.max(), 0.0))
+def prove_epsilon(grasp, answer, tolerance: float | None = None) -> Proof:
+    """What the evidence of ``answer`` proves of ``grasp``; shapes (*batch,)."""
+    batch, dimension = grasp.position.shape[:-2], grasp.position.shape[-1]
+    known, eps = rebuild(grasp), float(np.finfo(np.dtype(grasp.position.dtype)).eps)
+    claim = _claim(answer, batch, known, 3 if dimension == 2 else 6)
+    room = max(ROOM, NEARBY * eps) if tolerance is None else float(tolerance)
+    lanes = len(known.valid)
+    level, distance = np.zeros(lanes, int), np.zeros(lanes)
+    lower, upper = np.full(lanes, np.nan), np.full(lanes, np.nan)
+    with np.errstate(all="ignore"):
+        for lane in range(lanes):
+            if known.valid[lane]:
+                found = _Lane(known, claim, lane, dimension, eps, room).proved()
+                level[lane], distance[lane], lower[lane], upper[lane] = found
+            elif claim.status[lane] == INVALID and np.isnan(claim.lower[lane]) and np.isnan(claim.upper[lane]):
+                level[lane] = 2
+    distance = np.where(level == 2, 0.0, np.where(level == 1, distance, np.inf))
+    parts = (LEVELS[level], distance, lower, upper, np.zeros(lanes))
+    return Proof(*(x.reshape(batch) for x in parts))
 
 
-def prove_epsilon(grasp, result, tolerance: float | None = None) -> Proof:
-    """What the evidence proves; shape of ``result.status``."""
-    accepted = np.asarray(check_epsilon(grasp, result, tolerance))
-    nan = np.full(accepted.shape, np.nan)
-    return Proof(
-        LEVELS[accepted.astype(int)], np.where(accepted, 0.0, np.inf), nan, nan, np.zeros(accepted.shape)
+def _claim(answer, batch: tuple[int, ...], known: Rebuilt, m: int) -> Claim:
+    said, (k, n) = Fields(answer, batch), known.scale.shape[1:]
+    shapes = np.shape(getattr(answer, "forces", None)), np.shape(getattr(answer, "facets", None))
+    if any(len(shape) != len(batch) + 2 for shape in shapes) or getattr(answer, "norm", None) not in NORMS:
+        raise Malformed("forces, facets or norm")
+    facets = np.asarray(answer.facets)
+    if facets.dtype.kind not in "iu" or facets.shape != (*batch, shapes[1][-2], m):
+        raise Malformed("facets")
+    vertices = shapes[0][-2]
+    return Claim(
+        said.numbers("status"),
+        said.numbers("lower"),
+        said.numbers("upper"),
+        said.numbers("torque_scale"),
+        said.numbers("direction", m),
+        said.numbers("touching", k * n).reshape(-1, k, n),
+        said.numbers("forces", vertices, k * n).reshape(-1, vertices, k, n),
+        facets.reshape(-1, shapes[1][-2], m),
+        answer.norm,
     )
 
 
-def check_epsilon(grasp, result, tolerance: float | None = None) -> np.ndarray:
-    """True for each lane whose bounds the evidence proves; shape of ``result.status``."""
-    shape = np.shape(result.status)
-    dimension, k = grasp.position.shape[-1], grasp.position.shape[-2]
-    m = 3 if dimension == 2 else 6
-    known = rebuild(grasp)
-    n = len(known.components)
-    lanes = len(known.valid)
+class _Lane:
+    """One valid lane."""
 
-    def rows(array, *own):
-        return np.asarray(array, np.float64).reshape(lanes, *own)
+    def __init__(self, known: Rebuilt, claim: Claim, lane: int, dimension: int, eps: float, room: float):
+        self.known, self.claim, self.lane, self.dimension = known, claim, lane, dimension
+        self.eps, self.room = eps, room
+        self.live = known.live[lane]
+        self.row_scale = np.ones(claim.direction.shape[-1])
+        self.row_scale[dimension:] = known.length[lane] / claim.scale[lane]
+        self.blocks = known.blocks[lane] * self.row_scale[:, None]  # (k, m, n), torques over the torque scale
+        self.size = float(np.linalg.norm(self.blocks))
 
-    status = np.asarray(result.status).reshape(-1)
-    lower, upper, direction = rows(result.lower), rows(result.upper), rows(result.direction, m)
-    scale = rows(result.torque_scale)
-    V, F = np.shape(result.forces)[-2], np.shape(result.facets)[-2]
-    forces, facets = rows(result.forces, V, k, n), np.asarray(result.facets).reshape(lanes, F, m)
-    room = max(ROUNDING, 64 * float(np.finfo(grasp.position.dtype).eps)) if tolerance is None else tolerance
-    accepted = np.zeros(lanes, bool)
-    for lane in range(lanes):
-        if status[lane] == INVALID or not known.valid[lane]:
-            accepted[lane] = status[lane] == INVALID and not known.valid[lane]
-            continue
-        row_scale = np.ones(m)
-        row_scale[dimension:] = known.length[lane] / scale[lane]
-        unit = np.linalg.norm(direction[lane])
-        if not (np.isfinite(unit) and abs(unit - 1) < 1e-6 and 0 <= lower[lane] <= upper[lane] * (1 + room)):
-            continue
-        largest = np.linalg.norm(known.A[lane] * row_scale[:, None])
-        top = _support(known, lane, direction[lane] / unit, row_scale, result.norm)
-        if top > upper[lane] * (1 + room) + 256 * np.finfo(grasp.position.dtype).eps * largest:
-            continue
-        if lower[lane] == 0:
-            accepted[lane] = True  # claims nothing
-            continue
-        used = facets[lane][facets[lane][:, 0] >= 0]
-        points, s = _wrenches(known, lane, forces[lane], row_scale)
-        normal, tail = s[..., 0], np.linalg.norm(s[..., 1:], axis=-1)
-        effort = normal.sum(axis=-1) if result.norm == "L1" else normal.max(axis=-1)
-        inside = (tail <= normal + room).all() and (effort <= 1 + room).all()
-        inside &= bool((np.abs(s[:, ~known.live[lane]]) == 0).all())
-        accepted[lane] = bool(inside) and _surrounds(points, used, lower[lane] * (1 - room))
-    return accepted.reshape(shape)
+    def proved(self) -> tuple[int, float, float, float]:
+        """Level, distance, and the bracket that is proved."""
+        claim, lane, nothing = self.claim, self.lane, (0, np.inf, np.nan, np.nan)
+        status, lower, upper = int(claim.status[lane]), float(claim.lower[lane]), float(claim.upper[lane])
+        length = float(np.linalg.norm(claim.direction[lane]))
+        sound = claim.scale[lane] > 0 and np.isfinite(self.blocks).all() and np.isfinite(upper)
+        sound = sound and abs(length - 1) <= NEARBY * self.eps and 0 <= lower <= upper
+        if not (sound and self._touching_is_possible()):
+            return nothing
+        if status == NOT_RESISTANT:
+            level, distance = self._escapes() if upper == 0 else (0, np.inf)
+            return (level, distance, 0.0, 0.0) if level else nothing
+        top = self._support(claim.direction[lane] / length)
+        if top > upper * (1 + self.room) + 16 * self.eps * self.size:
+            return nothing
+        if status == RESISTANT and lower > 0:
+            ball = self._ball()
+            return (2, 0.0, ball, top) if ball >= lower * (1 - self.room) else nothing
+        idle = status == UNDECIDED or (status == MARGINAL and upper <= NEARLY_NOTHING * self.size)
+        return (2, 0.0, 0.0, top) if idle and lower == 0 else nothing
+
+    def _support(self, direction: np.ndarray) -> float:
+        """h(direction), rounded up."""
+        v = np.einsum("kmn,m->kn", self.blocks, direction)
+        blur = 32 * EPS * np.linalg.norm(self.blocks, axis=(-2, -1))
+        h = np.where(self.live, v[:, 0] + np.linalg.norm(v[:, 1:], axis=-1) + blur, 0.0)
+        h = np.maximum(h, 0.0)
+        return float(h.sum() * (1 + len(h) * EPS) if self.claim.norm == "Linf" else h.max())
+
+    def _unit_effort(self, forces: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Scaled forces (V, k, n) pulled into their cones and to unit effort; whether that was rounding."""
+        s = scaled_force(forces, self.known.scale[self.lane], self.known.normal_index)
+        head, tail = s[..., 0], np.linalg.norm(s[..., 1:], axis=-1)
+        effort = head.sum(-1) if self.claim.norm == "L1" else head.max(-1)
+        fits = np.isfinite(s).all() and (tail <= head + self.room).all() and (effort <= 1 + self.room).all()
+        fits = bool(fits) and not s[:, ~self.live].any()
+        head = np.maximum(head, 0.0)
+        shrink = np.minimum(1.0, head / np.where(tail > 0, tail, 1.0)) * (1 - 8 * EPS)
+        s = np.concatenate([head[..., None], s[..., 1:] * shrink[..., None]], -1)
+        effort = head.sum(-1) if self.claim.norm == "L1" else head.max(-1)
+        return s / (np.maximum(effort, 1.0) * (1 + 64 * EPS))[:, None, None], fits
+
+    def _touching_is_possible(self) -> bool:
+        return self._unit_effort(self.claim.touching[self.lane][None])[1]
+
+    def _ball(self) -> float:
+        """The radius that the vertices' hull surely holds."""
+        facets = self.claim.facets[self.lane]
+        facets = facets[facets[:, 0] >= 0]
+        s, fits = self._unit_effort(self.claim.forces[self.lane])
+        if not fits or not len(facets):
+            return 0.0
+        points = np.einsum("kmn,vkn->vm", self.blocks, s)
+        terms = s.shape[1] * s.shape[2] + 24
+        blur = terms * EPS * self.size * float(np.max(np.linalg.norm(s.reshape(len(s), -1), axis=-1)))
+        return ball_inside(points, facets) - blur
+
+    def _escapes(self) -> tuple[int, float]:
+        """``direction`` as a twist that no contact can oppose, turned round."""
+        known, lane = self.known, self.lane
+        live = self.live
+        grasp = exact_grasp(
+            known.position[lane][live], known.normal[lane][live], known.friction[lane][live], known.torsion[lane][live]
+        )
+        xi, scaled = -self.claim.direction[lane] * self.row_scale, scaled_lane(known, lane, self.dimension)
+        if escape_twist(grasp, scaled, xi) is not None:
+            return 2, 0.0
+        distance = rounding_distance(grasp, scaled, xi, known.friction[lane][live])
+        return (1, distance) if distance <= NEARBY * self.eps else (0, np.inf)

@@ -270,7 +270,8 @@ def _answer(
     away = _unresisted(grasp, verdict.escape_twist, lax.stop_gradient(length))
     direction = jnp.where(resistant[..., None], found.direction, away)
     edge = _supports(lax.stop_gradient(A), grasp.active, norm, direction)
-    lower = _bound(verdict.status, found.lower, jnp.zeros_like(edge))
+    # Where the search ends in a corner both are epsilon, and rounding must not turn them round.
+    lower = _bound(verdict.status, jnp.minimum(found.lower, found.upper), jnp.zeros_like(edge))
     upper = _bound(verdict.status, found.upper, edge)
     # d(epsilon) = d . dA f with the touching wrench's d and f held, by the envelope theorem
     moved = jnp.where(resistant[..., None, None, None], A, lax.stop_gradient(A))
