@@ -164,9 +164,12 @@ def _primal_evidence(tile: Tile, rank: Rank, full_rank: Array, u: Cone) -> Prima
     known = room > 0
     safe = jnp.where(known, room, one)
     shift = jnp.sqrt(2 * one) * (residual + rounding * folded.norm * size) / safe
-    # The exact internal force lies within near / 2 of s.
-    near = 2 * jnp.sqrt(2 * one) * (residual + _evaluation(s) * folded.norm * size) / safe
-    near = jnp.where(known, near + 8 * eps * size, jnp.inf * one)
+    # The exact internal force lies within half of this of s; its mean normal force is 1 to within ``drift``.
+    distance = 2 * (residual + _evaluation(s) * folded.norm * size) / safe + 4 * eps * size
+    drift = distance / jnp.sqrt(folded.count)
+    near = 2 * (distance + jnp.abs(slack) * drift)
+    meant = jnp.abs(cone_sum(s[0]) - folded.count) < 0.5  # not so where s had no mean to be scaled by
+    near = jnp.where(known & meant & (drift < 0.5), near, jnp.inf * one)
     return Primal(s, slack, near, full_rank & known & (shift < slack))
 
 
@@ -198,9 +201,7 @@ def _bracket(primal: Primal, dual: Dual) -> Bracket:
     eps = unit_roundoff(primal.slack.dtype)
     blur = 16 * eps * (1 + jnp.abs(primal.slack) + jnp.abs(dual.upper))
     lower, upper = primal.slack - blur - primal.near, dual.upper + blur
-    # Rounding must not turn the bracket round.
-    lower, upper = jnp.minimum(lower, upper), jnp.maximum(lower, upper)
-    return Bracket(lower, upper, blur)
+    return Bracket(jnp.minimum(lower, upper), upper, blur)  # rounding must not turn the bracket round
 
 
 def _status(
