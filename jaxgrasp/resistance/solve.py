@@ -60,6 +60,7 @@ from ..core import (
 )
 from .derivatives import Scales, Solved, differentiable
 from .problem import Start, margin_program, starting_point
+from .second_attempt import second_attempt
 from .verdict import Rank, Verdict, judge, unnoticed
 
 __all__ = ["WrenchResistance", "wrench_resistance"]
@@ -283,6 +284,19 @@ def _rank_kernel(plan: _Plan) -> Callable[[Contacts], Rank]:
     return run
 
 
+def _second(plan: _Plan, tolerance: Array) -> Callable[[tuple[Contacts, Verdict]], Verdict]:
+    """No kernel: sums of pairs are reductions, which a kernel cannot hold, and few lanes come here."""
+
+    def run(rows: tuple[Contacts, Verdict]) -> Verdict:
+        contacts, first = rows
+        length = fold(contacts, plan.components).length
+        lanes = jax.tree.map(to_lanes, first)
+        found = second_attempt(plan.components, plan.dimension, contacts, length, lanes, tolerance)
+        return jax.tree.map(to_rows, found)
+
+    return run
+
+
 def _solve_rows(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array) -> Solved:
     """All sweeps over the first ``count`` of (N, ..) rows; N is a multiple of the tile width."""
     n, m, dtype = contacts.position.shape[0], wrench_dimension(plan.dimension), contacts.position.dtype
@@ -305,6 +319,13 @@ def _solve_rows(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array)
     sweeps = Sweeps(step, unfinished, len(plan.budgets), between)
     shapes = jax.eval_shape(first, contacts, unknown)
     state, verdict, _, scales, y = in_sweeps(sweeps, contacts, unknown, shapes, count, plan.width)
+    verdict = map_selected(
+        _second(plan, tolerance),
+        (verdict.status == Status.UNDECIDED.value) & (jnp.arange(n) < count),
+        (contacts, verdict),
+        verdict,
+        plan.width,
+    )
     point = None
     if y is not None:
         point = (y, jnp.stack(state.point.u, 1), jnp.stack(state.point.z, 1))
