@@ -9,6 +9,7 @@ Computer Programming 2, 4.2.2; Hida, Li, Bailey, Library for double-double and q
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,6 +56,35 @@ def _two_product(a: Array, b: Array) -> tuple[Array, Array]:
     return p, e + (rest + al * bl)
 
 
+Parts = tuple[Array, Array]
+
+
+def _added(x: Parts, y: Parts) -> Parts:
+    s, e = _two_sum(x[0], y[0])
+    t, f = _two_sum(x[1], y[1])
+    s, e = _quick_two_sum(s, e + t)
+    return _quick_two_sum(s, e + f)
+
+
+def _multiplied(x: Parts, y: Parts) -> Parts:
+    p, e = _two_product(x[0], y[0])
+    return _quick_two_sum(p, e + (x[0] * y[1] + x[1] * y[0]))
+
+
+def _folded(
+    combine: Callable[[Parts, Parts], Parts], unit: float, hi: Array, lo: Array, axes: tuple[int, ...]
+) -> Pair:
+    """``combine`` over ``axes``. As a reduction an operation is one loop, its code compiled once, and no half of a
+    result is computed twice, with other rounding."""
+    units = np.asarray(unit, hi.dtype), np.zeros((), hi.dtype)
+    return Pair(*lax.reduce((hi, lo), units, combine, axes))
+
+
+def _both(combine: Callable[[Parts, Parts], Parts], unit: float, x: Pair, y: Pair) -> Pair:
+    hi, lo = (jnp.stack(jnp.broadcast_arrays(a, b)) for a, b in ((x.hi, y.hi), (x.lo, y.lo)))
+    return _folded(combine, unit, hi, lo, (0,))
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Pair:
@@ -68,31 +98,26 @@ class Pair:
 
     def __add__(self, other: Number) -> Pair:
         other = pair(other, self.hi.dtype)
-        s, e = _two_sum(self.hi, other.hi)
-        t, f = _two_sum(self.lo, other.lo)
-        s, e = _quick_two_sum(s, e + t)
-        return Pair(*_quick_two_sum(s, e + f))
+        return _both(_added, 0.0, self, other)
 
     def __sub__(self, other: Number) -> Pair:
         return self + -pair(other, self.hi.dtype)
 
     def __mul__(self, other: Number) -> Pair:
         other = pair(other, self.hi.dtype)
-        p, e = _two_product(self.hi, other.hi)
-        return Pair(*_quick_two_sum(p, e + (self.hi * other.lo + self.lo * other.hi)))
+        return _both(_multiplied, 1.0, self, other)
 
     def __truediv__(self, other: Number) -> Pair:
-        other = pair(other, self.hi.dtype)
-        first = self.hi / other.hi
-        rest = self - other * first
-        second = rest.hi / other.hi
-        rest = rest - other * second
-        return Pair(*_quick_two_sum(first, second)) + rest.hi / other.hi
+        return self * reciprocal(pair(other, self.hi.dtype))
 
     def __rtruediv__(self, other: Number) -> Pair:
-        return pair(other, self.hi.dtype) / self
+        return reciprocal(self) * other
 
     __radd__, __rmul__ = __add__, __mul__
+
+    def scaled(self, power: float) -> Pair:
+        """Times a power of two."""
+        return Pair(power * self.hi, power * self.lo)
 
     def __getitem__(self, index: Any) -> Pair:
         return Pair(self.hi[index], self.lo[index])
@@ -109,13 +134,18 @@ def pair(x: Number, dtype: Any = None) -> Pair:
     return Pair(x, jnp.zeros_like(x))
 
 
+def reciprocal(x: Pair) -> Pair:
+    """``1 / x``: the rounded one and a step of Newton's."""
+    y = pair(1 / x.hi)
+    return y + y * (1.0 + -(x * y))
+
+
 def pair_sqrt(x: Pair) -> Pair:
     """``sqrt(x)``; 0 where x is not positive."""
     there = x.hi > 0
     root = jnp.sqrt(jnp.where(there, x.hi, jnp.ones_like(x.hi)))
-    rest = x - pair(root) * pair(root)
-    found = Pair(*_quick_two_sum(root, rest.hi / (2 * root)))
-    return pair_where(there, found, pair(jnp.zeros_like(x.hi)))
+    rest = x + -(pair(root) * root)
+    return pair_where(there, pair(root) + rest.hi / (2 * root), pair(jnp.zeros_like(x.hi)))
 
 
 def pair_where(condition: Array, x: Pair, y: Pair) -> Pair:
@@ -125,10 +155,4 @@ def pair_where(condition: Array, x: Pair, y: Pair) -> Pair:
 
 def pair_sum(x: Pair, *axes: int) -> Pair:
     """The sum over ``axes``."""
-    zero = np.zeros((), x.hi.dtype)
-
-    def combine(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
-        total = Pair(*a) + Pair(*b)
-        return total.hi, total.lo
-
-    return Pair(*lax.reduce((x.hi, x.lo), (zero, zero), combine, axes))
+    return _folded(_added, 0.0, x.hi, x.lo, axes)

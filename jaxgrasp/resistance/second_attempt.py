@@ -25,7 +25,7 @@ from jax import lax
 from ..backend import to_lanes
 from ..conic import Pair, pair, pair_roundoff, pair_sqrt, pair_sum, pair_where
 from ..contacts import Component, Contacts, normal_first
-from ..core import Array, Status, cross_components, first_of, frame_components, unit_roundoff
+from ..core import Array, Status, first_of, frame_components, unit_roundoff
 from .verdict import Verdict
 
 __all__ = ["second_attempt"]
@@ -56,43 +56,62 @@ def _stack(parts: list[Pair]) -> Pair:
     return jax.tree.map(lambda *x: jnp.stack(x), *parts)
 
 
-def _dot(x: tuple[Pair, ...] | list[Pair], y: tuple[Pair, ...] | list[Pair]) -> Pair:
-    return pair_sum(_stack([a * b for a, b in zip(x, y, strict=True)]), 0)
-
-
 def _fold(
     contacts: Contacts, components: tuple[Component, ...], valid: Array, length: Array
 ) -> tuple[Pair, Array]:
-    """A of valid lanes, and the factors (mu, gamma) between forces and folded forces."""
+    """A (m, d, k, L) of valid lanes, and the factors (d, k, L) between forces and folded forces."""
     position, normal, friction, torsion, active = (to_lanes(x) for x in contacts)
     dimension, live = position.shape[1], active & valid
     last = np.eye(dimension, dtype=position.dtype)[-1:, :, None]
-    point = [pair(jnp.where(live, position[:, i], 0)) / pair(length) for i in range(dimension)]
-    raw = jnp.where(live[:, None], normal, last)
-    raw = raw * jnp.exp2(-jnp.floor(jnp.log2(jnp.max(jnp.abs(raw), axis=1, keepdims=True))))  # exact
-    rows = [pair(raw[:, i]) for i in range(dimension)]
-    size = pair_sqrt(_dot(rows, rows))
-    unit = tuple(x / size for x in rows)
-    frames = frame_components(unit, jnp.where(raw[:, -1] >= 0, 1.0, -1.0).astype(raw.dtype))
-    exists = live.astype(raw.dtype)
-    zero = pair(jnp.zeros_like(exists))
-    mu, gamma = jnp.where(live, friction, 0), jnp.where(live, torsion, 0)
-    columns, scale = [], []
+    point, raw = (
+        jnp.swapaxes(jnp.where(live[:, None], x, y), 0, 1) for x, y in ((position, 0 * last), (normal, last))
+    )
+    lengths = 1.0 / pair(length)
+    point = pair(point) * lengths
+    rows = pair(raw * jnp.exp2(-jnp.floor(jnp.log2(jnp.max(jnp.abs(raw), axis=0)))))  # times a power of two
+    unit = rows / pair_sqrt(pair_sum(rows * rows, 0))
+    sign = jnp.where(raw[-1] >= 0, 1.0, -1.0).astype(raw.dtype)
+    frames = frame_components(tuple(unit[i] for i in range(dimension)), sign)
+    exists, mu, gamma = (jnp.where(live, x, 0) for x in (jnp.ones_like(friction), friction, torsion))
+    directions, scale = [], []
     for component in normal_first(components):
         if component is Component.SPIN:
-            spin = pair(gamma) / pair(length)
-            columns.append(_stack([*(zero for _ in unit), *(spin * x for x in unit)]))
-            scale.append(gamma)
             continue
-        direction = (
-            unit if component is Component.NORMAL else frames[0 if component is Component.TANGENT_1 else 1]
-        )
-        factor = exists if component is Component.NORMAL else mu
-        moment = cross_components(tuple(point), direction)
-        columns.append(_stack([pair(factor) * x for x in (*direction, *moment)]))
-        scale.append(factor)
-    A = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), _stack(columns))
+        tangent = frames[0 if component is Component.TANGENT_1 else -1]
+        directions.append(unit if component is Component.NORMAL else _stack(list(tangent)))
+        scale.append(exists if component is Component.NORMAL else mu)
+    force = _moved(_stack(directions) * jnp.stack(scale)[:, None])  # (dimension, d, k, L)
+    if dimension == 2:
+        moment = point[:1, None] * force[1:] - point[1:, None] * force[:1]
+    else:
+        turned = [
+            _rolled(point, 1)[:, None] * _rolled(force, 2),
+            _rolled(point, 2)[:, None] * _rolled(force, 1),
+        ]
+        moment = turned[0] - turned[1]
+    A = _joined(force, moment)
+    if Component.SPIN in components:
+        spin = unit * (gamma * lengths)
+        A = _joined(A, _joined(_zeros(spin), spin)[:, None], 1)
+        scale.append(gamma)
     return A, jnp.stack(scale)
+
+
+def _moved(x: Pair) -> Pair:
+    return jax.tree.map(lambda v: jnp.swapaxes(v, 0, 1), x)
+
+
+def _rolled(x: Pair, by: int) -> Pair:
+    """x_(i + by) at i, along the first axis."""
+    return jax.tree.map(lambda v: jnp.roll(v, -by, 0), x)
+
+
+def _joined(x: Pair, y: Pair, axis: int = 0) -> Pair:
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis), x, y)
+
+
+def _zeros(x: Pair) -> Pair:
+    return jax.tree.map(jnp.zeros_like, x)
 
 
 def _orthonormal(A: Pair) -> tuple[Pair, Pair]:
@@ -100,7 +119,7 @@ def _orthonormal(A: Pair) -> tuple[Pair, Pair]:
     m, d, k, lanes = A.hi.shape
     identity = jnp.broadcast_to(jnp.eye(m, dtype=A.hi.dtype)[:, :, None], (m, m, lanes))
     flat = jax.tree.map(lambda x: x.reshape(m, d * k, lanes), A)
-    wide = jax.tree.map(lambda x, y: jnp.concatenate([x, y], 1), flat, pair(identity))
+    wide = _joined(flat, pair(identity), 1)
     floor = jnp.sqrt(jnp.max(jnp.sum(flat.hi * flat.hi, axis=1), axis=0)) * (
         2.0**12 * pair_roundoff(A.hi.dtype)
     )
@@ -145,7 +164,7 @@ def _mirrored(x: Pair, axis: int = 0) -> Pair:
 def _solved(H: Pair, rhs: Pair) -> Pair:
     """``H^-1 rhs`` (m, r, L) by elimination without pivoting, for positive definite H (m, m, L)."""
     m = H.hi.shape[0]
-    wide = jax.tree.map(lambda x, y: jnp.concatenate([x, y], 1), H, rhs)
+    wide = _joined(H, rhs, 1)
 
     def one(j: Array, rows: Pair) -> Pair:
         row = jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, j, 0, keepdims=False), rows)
@@ -185,13 +204,12 @@ def _step(B: Pair, a: Pair, exists: Array, state: _State, goal: Array) -> _State
     inverse = 1.0 / pair_sum(z * _mirrored(z), 0)
     w = _mirrored(z) * inverse[None]
     along = pair_sum(B * w[None], 1)  # (m, k, L)
-    C = 4.0 * (w[None] * along[:, None]) - _mirrored(B, 1) * (2.0 * inverse)
+    C = (w[None] * along[:, None]).scaled(4.0) - _mirrored(B, 1) * inverse.scaled(2.0)
     H = pair_sum(B[:, None] * C[None], 2, 3)
-    force = pair_sum(along, 1)
-    force = force + force  # B g
+    force = pair_sum(along, 1).scaled(2.0)  # B g
     dy = _solved(H, jax.tree.map(lambda p, q: jnp.stack([-p, -q], 1), a, force))
-    p, q = (-pair_sum(a * dy[:, i], 0).hi for i in (0, 1))
-    r = -pair_sum(force * dy[:, 1], 0).hi
+    ends = jax.tree.map(lambda x, y, z: jnp.stack([x, x, z], 1), a, a, force)
+    p, q, r = -pair_sum(ends * dy[:, np.array([0, 1, 1])], 0).hi
     safe = jnp.where(p > 0, p, jnp.ones_like(p))
     disc = q * q - p * (r - RADIUS * RADIUS)
     inside = (disc > 0) & (p > 0)
@@ -204,8 +222,8 @@ def _step(B: Pair, a: Pair, exists: Array, state: _State, goal: Array) -> _State
         return step, -_transposed(B, step)
 
     _, dz = direction(tau)
-    bent = 2.0 * (w * pair_sum(w * dz, 0)) - _mirrored(dz) * inverse
-    u = (w - bent) * (2.0 / pair(tau))
+    bent = (w * pair_sum(w * dz, 0)).scaled(2.0) - _mirrored(dz) * inverse
+    u = (w - bent) * (1.0 / pair(tau)).scaled(2.0)
     u = pair_where(padding, pair(jnp.zeros_like(u.hi)), u)
     lower = jnp.where(inside, (1.0 + -pair_sum(u[0], 0) / count).hi, -jnp.inf)
     upper = (1.0 + pair_sum(a * state.y, 0)).hi

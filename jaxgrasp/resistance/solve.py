@@ -284,19 +284,6 @@ def _rank_kernel(plan: _Plan) -> Callable[[Contacts], Rank]:
     return run
 
 
-def _second(plan: _Plan, tolerance: Array) -> Callable[[tuple[Contacts, Verdict]], Verdict]:
-    """No kernel: sums of pairs are reductions, which a kernel cannot hold, and few lanes come here."""
-
-    def run(rows: tuple[Contacts, Verdict]) -> Verdict:
-        contacts, first = rows
-        length = fold(contacts, plan.components).length
-        lanes = jax.tree.map(to_lanes, first)
-        found = second_attempt(plan.components, plan.dimension, contacts, length, lanes, tolerance)
-        return jax.tree.map(to_rows, found)
-
-    return run
-
-
 def _solve_rows(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array) -> Solved:
     """All sweeps over the first ``count`` of (N, ..) rows; N is a multiple of the tile width."""
     n, m, dtype = contacts.position.shape[0], wrench_dimension(plan.dimension), contacts.position.dtype
@@ -319,17 +306,26 @@ def _solve_rows(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array)
     sweeps = Sweeps(step, unfinished, len(plan.budgets), between)
     shapes = jax.eval_shape(first, contacts, unknown)
     state, verdict, _, scales, y = in_sweeps(sweeps, contacts, unknown, shapes, count, plan.width)
-    verdict = map_selected(
-        _second(plan, tolerance),
-        (verdict.status == Status.UNDECIDED.value) & (jnp.arange(n) < count),
-        (contacts, verdict),
-        verdict,
-        plan.width,
-    )
     point = None
     if y is not None:
         point = (y, jnp.stack(state.point.u, 1), jnp.stack(state.point.z, 1))
     return Solved(verdict, state.iterations, state.stop, point, scales)
+
+
+def _second_rows(plan: _Plan, contacts: Contacts, first: Verdict, tolerance: Array) -> Verdict:
+    """``first`` with a second attempt at the rows it leaves undecided.
+
+    No kernel: the sums of pairs are reductions, which a kernel cannot hold, and few rows come here.
+    """
+
+    def run(rows: tuple[Contacts, Verdict]) -> Verdict:
+        contacts, first = rows[0], jax.tree.map(to_lanes, rows[1])
+        length = fold(contacts, plan.components).length
+        found = second_attempt(plan.components, plan.dimension, contacts, length, first, tolerance)
+        return jax.tree.map(to_rows, found)
+
+    undecided = first.status == Status.UNDECIDED.value
+    return map_selected(run, undecided, (contacts, first), first, plan.width)
 
 
 def _answer(solved: Solved) -> WrenchResistance:
@@ -350,7 +346,11 @@ def _answer(solved: Solved) -> WrenchResistance:
 
 @functools.cache
 def _compiled(plan: _Plan) -> Callable[..., WrenchResistance]:
-    solve = batched(functools.partial(_solve_rows, plan), lambda rows: rows.active.shape[:-1], plan.width)
+    def rows(contacts: Contacts, count: Array, tolerance: Array) -> Solved:
+        solved = _solve_rows(plan, contacts, count, tolerance)
+        return solved._replace(verdict=_second_rows(plan, contacts, solved.verdict, tolerance))
+
+    solve = batched(rows, lambda rows: rows.active.shape[:-1], plan.width)
     run = differentiable(solve, plan.components, not plan.verdict_only, plan.width)
 
     def result(contacts: Contacts, tolerance: Array) -> WrenchResistance:
@@ -361,13 +361,23 @@ def _compiled(plan: _Plan) -> Callable[..., WrenchResistance]:
 
 
 @functools.partial(jax.jit, static_argnames=("plan",))
-def _solve_chunk(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array) -> WrenchResistance:
-    return _answer(_solve_rows(plan, contacts, count, tolerance))
+def _solve_chunk(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array) -> Solved:
+    return _solve_rows(plan, contacts, count, tolerance)
+
+
+@functools.partial(jax.jit, static_argnames=("plan",))
+def _second_chunk(plan: _Plan, contacts: Contacts, first: Verdict, tolerance: Array) -> Verdict:
+    return _second_rows(plan, contacts, first, tolerance)
 
 
 def _solve_on_host(plan: _Plan, contacts: Contacts, tolerance: Array) -> WrenchResistance:
+    """The same programs one after the other, so that the second is compiled only where a lane needs it."""
+
     def solve(rows: Contacts, count: Array) -> WrenchResistance:
-        return _solve_chunk(plan, rows, count, tolerance)
+        solved = _solve_chunk(plan, rows, count, tolerance)
+        if np.any(np.asarray(solved.verdict.status) == Status.UNDECIDED.value):
+            solved = solved._replace(verdict=_second_chunk(plan, rows, solved.verdict, tolerance))
+        return _answer(solved)
 
     return in_chunks(solve, contacts, contacts.active.shape[:-1], CHUNK)
 
