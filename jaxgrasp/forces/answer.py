@@ -49,12 +49,14 @@ class Values(NamedTuple):
     """A criterion between its bound and its cost (L,), in the caller's units.
 
     scale  the objective, what the gap is relative to      rounding   what evaluating the bound can lose
+    stored  what it can lose when it is evaluated from the twist of A, as it is stored
     """
 
     cost: Array
     bound: Array
     scale: Array
     rounding: Array
+    stored: Array
 
 
 class Proofs(NamedTuple):
@@ -137,9 +139,8 @@ def answer(problem: ForceProblem, state: ConvexState, tolerance: Array) -> Answe
     m, dtype = program.rhs.shape[0], problem.tile.folded.norm.dtype
     u = _polished(projection.basis.columns, program.rhs, program.exists, state.point.u)
     rows, ray = _all_rows(state.point), _to_size_one(state.ray)
-    values = _values(problem, state.point, u, rows)
-
     found = Multipliers(rows, ray, to_twist(projection, rows[:m]), to_twist(projection, ray[:m]))
+    values = _values(problem, state.point, u, found)
     load = load._replace(rest=load.rest & (problem.demand.criterion.barrier_weight is None))
     status = _status(
         Lanes(problem.valid, load.off, load.rest, state.stop),
@@ -153,12 +154,15 @@ def answer(problem: ForceProblem, state: ConvexState, tolerance: Array) -> Answe
     return _in_user_units(problem._replace(load=load), status, u, values, found)
 
 
-def _values(problem: ForceProblem, point: ConvexPoint, u: Cone, rows: Array) -> Values:
+def _values(problem: ForceProblem, point: ConvexPoint, u: Cone, found: Multipliers) -> Values:
+    rows, twist = found.rows, found.twist
     program, size, barrier = problem.program, problem.load.size, problem.demand.barrier()
     cost = criterion_value(program, u, size, barrier)
     bound = dual_value(program, rows, u, size, barrier)
     bound = jnp.where(jnp.isnan(bound), -jnp.inf, bound)
-    return Values(cost, bound, _scale(program, point, size), _rounding(program, rows, u, size))
+    rounding = _rounding(program, rows, u, size)
+    stored = _stored(problem.tile.folded.norm, twist, rounding, program, u, size)
+    return Values(cost, bound, _scale(program, point, size), rounding, stored)
 
 
 def _proofs(problem: ForceProblem, found: Multipliers) -> Proofs:
@@ -191,6 +195,15 @@ def _rounding(program: ConvexConeProgram, rows: Array, u: Cone, size: Array) -> 
 
 
 @stage
+def _stored(
+    norm: Array, twist: Array, rounding: Array, program: ConvexConeProgram, u: Cone, size: Array
+) -> Array:
+    blur = vector_norm(twist) * norm * jnp.sqrt(cone_sum(program.exists * inner(u, u))) * size
+    blur = jnp.asarray(8 * unit_roundoff(blur.dtype), blur.dtype) * blur
+    return rounding + (blur * size if program.curvature is not None else blur)
+
+
+@stage
 def _scale(program: ConvexConeProgram, point: ConvexPoint, size: Array) -> Array:
     value = program.size(point) * size
     return value * size if program.curvature is not None else value
@@ -201,6 +214,7 @@ def _in_user_units(
 ) -> Answer:
     """Newtons and metres; zeros, infinities and NaN where the status says so."""
     tile, squared = problem.tile, problem.program.curvature is not None
+    unbarred = problem.demand.criterion.barrier_weight is None
 
     @stage
     def run(
@@ -208,7 +222,10 @@ def _in_user_units(
         row_norm: Array | None, coefficients: tuple[Array, Array],
     ) -> tuple[Array, ...]:  # fmt: skip
         optimal, infeasible = status == Status.OPTIMAL.value, status == Status.INFEASIBLE.value
-        invalid, cost, bound = status == Status.INVALID.value, values.cost, values.bound
+        invalid, cost = status == Status.INVALID.value, values.cost
+        bound = jnp.where(jnp.isfinite(values.stored), values.bound - values.stored, -jnp.inf)
+        if unbarred:  # no forces cost less than 0
+            bound = jnp.maximum(bound, jnp.minimum(values.bound, jnp.zeros_like(bound)))
         m = found.twist.shape[0]
         nan, inf = jnp.full_like(cost, jnp.nan), jnp.full_like(cost, jnp.inf)
         zero = jnp.zeros_like(cost)
