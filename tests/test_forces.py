@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from grasps import ball
 from scipy.optimize import brentq
 
 import jaxgrasp as jg
@@ -312,3 +313,35 @@ def test_an_escape_proves_at_any_size(size):
     longer = {"escape_twist": size * out.escape_twist, "joint_rates": size * out.joint_rates}
     forged = out.__class__(**{**vars(out), **longer})
     assert jg.check(grasp, forged, **asked, torque_limits=(jacobian, torque)).all()
+
+
+@pytest.mark.f32
+def test_loads_that_over_or_underflow_are_invalid_or_solved(dtype):
+    """The pinch of a disc squeezed by w / (2 mu) a finger, for loads w whose squares are numbers."""
+    limit = 2.0**510 if dtype == "float64" else 2.0**62
+    tiny, huge = (1e-310, 1e308) if dtype == "float64" else (1e-40, 3e38)
+    grasp = jg.Grasp(np.array([[-1, 0], [1, 0]], dtype), np.array([[1, 0], [-1, 0]], dtype), jg.HardFinger(0.5))
+    loads = np.array([tiny, 1 / limit / 4, 2 / limit, 10.0, limit / 2, 4 * limit, huge, 0.0], dtype)
+    wrench = np.stack([0 * loads, -loads, 0 * loads], -1)
+    found = jg.optimize_forces(grasp, wrench)
+    invalid, optimal = [jg.Status.INVALID] * 2, [jg.Status.OPTIMAL]
+    assert list(found.status) == invalid + 3 * optimal + invalid + optimal
+    np.testing.assert_allclose(np.asarray(found.cost)[2:5] / loads[2:5], 1.0, rtol=1e-7 if dtype == "float64" else 1e-4)
+    assert found.cost[7] == 0
+
+
+@pytest.mark.skipif(not jax.config.jax_enable_x64, reason="compares with float64")
+def test_float32_stops_where_nothing_improves():
+    """Its residuals end at some 20 eps: waiting for less took every lane its whole budget of 60."""
+    rng = np.random.default_rng(3)
+    position, normal, friction = (x.astype(np.float32) for x in ball(rng, 300, 4))
+    load = rng.normal(size=(300, 6)).astype(np.float32)
+    grasp = jg.Grasp(position, normal, jg.HardFinger(friction))
+    found = jg.optimize_forces(grasp, load)
+    iterations = np.asarray(found.iterations)
+    assert (np.asarray(found.status) == jg.Status.OPTIMAL).sum() > 100
+    assert iterations.mean() < 15 and np.mean(iterations >= 60) < 0.02
+    exact = jg.optimize_forces(jax.tree.map(lambda x: x.astype(np.float64) if x.dtype != bool else x, grasp), load)
+    both = (np.asarray(found.status) == jg.Status.OPTIMAL) & (np.asarray(exact.status) == jg.Status.OPTIMAL)
+    assert (np.asarray(found.lower, np.float64) <= np.asarray(exact.upper))[both].all()
+    assert jg.check(grasp, found, wrench=load, criterion=jg.Gentlest()).all()

@@ -404,3 +404,98 @@ def test_half_precision_is_refused_with_what_to_do(dtype):
     whole = jg.Grasp(TETRAHEDRON, -TETRAHEDRON, jg.HardFinger(0.5))
     with pytest.raises(ValueError, match=f"{dtype}, but proofs need"):
         jg.wrench_resistance(jax.tree.map(lambda x: x.astype(dtype) if x.dtype != bool else x, whole))
+
+
+def moved(grasp, twist):
+    """Velocities (N, k, 3) of the contacts in metres over L for unit twists (v, L omega), and their normal parts."""
+    p, n = np.asarray(grasp.position, np.float64), unit(grasp.normal)
+    length = np.linalg.norm(p, axis=-1).max(-1)[:, None]
+    v, w = np.asarray(twist, np.float64)[:, :3], np.asarray(twist, np.float64)[:, 3:] * length
+    size = np.sqrt((v**2).sum(-1) + (w**2).sum(-1))[:, None]
+    v, w = v / size, w / size
+    velocity = v[:, None] + np.cross(w[:, None], p / length[..., None])
+    return velocity, (velocity * n).sum(-1)
+
+
+@F32
+def test_a_verdict_by_rank_holds_for_numbers_within_rounding(dtype):
+    """Contacts on a line, to rounding: each one's velocity is 0 within 64 eps, for any friction and any normals."""
+    rng = np.random.default_rng(8)
+    line = unit(rng.normal(size=(300, 1, 3)))
+    position = rng.uniform(-1, 1, (300, 4, 1)) * line * 10.0 ** rng.uniform(-3, 3, (300, 1, 1))
+    normal = rng.normal(size=position.shape) * 10.0 ** rng.uniform(-3, 3, (300, 4, 1))
+    friction = 10.0 ** rng.uniform(-4, 1, (300, 4))
+    grasp = jg.Grasp(position.astype(dtype), normal.astype(dtype), jg.HardFinger(friction))
+    res = jg.wrench_resistance(grasp)
+    no = np.asarray(res.status) == Status.NOT_RESISTANT
+    assert no.mean() > 0.99 and not (np.asarray(res.status) == Status.RESISTANT).any()
+    velocity, _ = moved(grasp, res.escape_twist)
+    by_rank = no & (np.asarray(res.lower) > 0)
+    assert by_rank.sum() > 30
+    assert np.linalg.norm(velocity, axis=-1)[by_rank].max() <= 64 * np.finfo(dtype).eps
+
+
+@F32
+def test_little_friction_is_not_taken_for_none(dtype):
+    """The tetrahedron is resistant at any mu > 0; NOT_RESISTANT only where rounding could make mu 0: up to 64 eps."""
+    eps = float(np.finfo(dtype).eps)
+    mu = eps * np.array([0.0, 1e-3, 1, 20, 70, 200, 1e3, 1e5])
+    shape = (len(mu), 4, 3)
+    position = np.broadcast_to(TETRAHEDRON, shape).astype(dtype)
+    res = jg.wrench_resistance(jg.Grasp(position, -position, jg.HardFinger(mu[:, None])))
+    no = np.asarray(res.status) == Status.NOT_RESISTANT
+    assert no[:4].all() and not no[4:].any()
+    assert (res.status[6], res.status[7]) == (Status.RESISTANT, Status.RESISTANT)
+
+
+def test_frictionless_contacts_on_a_line_have_no_full_rank():
+    """Singular values of rounding count once, by one rule; what is claimed of the rank is what SVD says."""
+    rng = np.random.default_rng(12)
+    line = unit(rng.normal(size=(500, 1, 3)))
+    position = rng.uniform(-0.2, 0.2, (500, 7, 1)) * line
+    grasp = jg.Grasp(position, rng.normal(size=position.shape), jg.Frictionless())
+    res = jg.wrench_resistance(grasp)
+    values = np.asarray(jg.contacts.grasp_singular_values(grasp))
+    eps = np.finfo(np.float64).eps
+    least, most = ((values > c * eps * values[:, :1]).sum(-1) for c in (128, 32))
+    rank = np.asarray(res.rank)
+    assert (least <= rank).all() and (rank <= most).all() and (rank < 6).all()
+    assert (np.asarray(res.status) == Status.NOT_RESISTANT).all()
+
+
+def test_minus_infinity_is_no_rounding_of_a_dependent_row():
+    """Two fingers with the line between them at 1e-3 to the first axis: rank 5, and a squeeze of finite margin."""
+    rng = np.random.default_rng(3)
+    far = unit(np.concatenate([np.ones((400, 1)), 1e-3 * rng.normal(size=(400, 2))], -1))
+    position = np.stack([far, -far], 1)
+    normal = -position + 0.2 * rng.normal(size=position.shape)
+    res = jg.wrench_resistance(jg.Grasp(position, normal, jg.HardFinger(0.5)))
+    assert (np.asarray(res.rank) == 5).all()
+    assert np.isfinite(np.asarray(res.lower)).all() and (np.asarray(res.gap) < 1e-6).mean() > 0.9
+
+
+def test_brackets_of_ill_conditioned_grasps_hold():
+    """Two contacts 1e-7 apart turn the margin hugely negative: lower <= upper, by independent longdouble arithmetic."""
+    rng = np.random.default_rng(4)
+    position = unit(rng.normal(size=(200, 7, 3)))
+    normal = -position + 0.3 * rng.normal(size=position.shape)
+    position[:, 1] = position[:, 0] + 1e-7 * rng.normal(size=(200, 3))
+    normal[:, 1] = normal[:, 0] + 1e-7 * rng.normal(size=(200, 3))
+    grasp = jg.Grasp(position, normal, jg.Frictionless())
+    res = jg.wrench_resistance(grasp)
+    wide = np.longdouble
+    n = np.asarray(normal, wide)
+    n /= np.sqrt((n * n).sum(-1, keepdims=True))
+    p = np.asarray(position, wide)
+    p /= np.sqrt((p * p).sum(-1).max(-1))[:, None, None]
+    A = np.swapaxes(np.concatenate([n, np.cross(p, n)], -1), 1, 2)  # (N, 6, 7): one null vector
+    null = np.linalg.svd(np.asarray(A, np.float64))[2][:, -1].astype(wide)
+    pinv = np.linalg.pinv(np.asarray(A, np.float64)).astype(wide)
+    for _ in range(4):
+        null = null - np.einsum("nij,nj->ni", pinv, np.einsum("nij,nj->ni", A, null))
+    true = null * (7 / null.sum(-1, keepdims=True))
+    true = true.min(-1)
+    error = 1e-15 * true**2  # of longdouble: the sum of the null vector cancels
+    assert (np.asarray(res.lower, wide) <= true + error).all()
+    assert (np.asarray(res.upper, wide) >= true - error).all()
+    assert (true < -1e3).sum() > 50

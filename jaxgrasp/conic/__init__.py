@@ -36,6 +36,7 @@ from .linear_interior_point import (
     solve_linear_cone_program,
 )
 from .linear_newton_step import LinearPoint, LinearStep
+from .pairs import Pair, pair, pair_roundoff, pair_sqrt, pair_sum, pair_where
 from .products import matvec, rmatvec, vector_inner, vector_norm
 from .reduced_kkt import KKTVector, kkt_solve
 from .regularity import regular
@@ -54,6 +55,7 @@ __all__ = [
     "LinearPoint",
     "LinearState",
     "LinearStep",
+    "Pair",
     "PointShift",
     "advance_linear_cone_program",
     "begin_convex_cone_program",
@@ -74,6 +76,11 @@ __all__ = [
     "matvec",
     "null_combination",
     "orthonormal_rows",
+    "pair",
+    "pair_roundoff",
+    "pair_sqrt",
+    "pair_sum",
+    "pair_where",
     "point_tangent",
     "regular",
     "residual_lower",

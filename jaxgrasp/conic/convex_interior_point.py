@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from ..backend import stage
-from ..core import Array, Status, first_of
+from ..core import Array, Status, first_of, unit_roundoff
 from .cone import cone_max, cone_min, cone_sum, inner, interior_distance
 from .convex_cone_program import ConvexConeProgram, ConvexPoint
 from .convex_newton_step import convex_newton_step, duality_excess
@@ -26,7 +26,8 @@ __all__ = ["ConvexState", "begin_convex_cone_program", "solve_convex_cone_progra
 
 STALL = StallRule(patience=4)
 CENTRED = 1e3  # tails of u o z, in products, that still leave forces right to 1e-7 at a gap of 1e-8
-ALMOST = 1e-6  # slow steps count only once |b - B u| is below this: before, growth of y is progress
+ALMOST = 1e-6  # slow steps count only once |b - B u| is below this, or below ..
+ALMOST_ROUNDING = 80  # .. so many eps: before, growth of y is progress
 
 
 class ConvexState(NamedTuple):
@@ -129,10 +130,14 @@ def _select(taken: Array, new: ConvexPoint, old: ConvexPoint) -> ConvexPoint:
     return jax.tree.map(lambda a, b: jnp.where(taken, a, b), new, old)
 
 
+def _almost(infeasibility: Array) -> Array:
+    return infeasibility <= max(ALMOST, ALMOST_ROUNDING * unit_roundoff(infeasibility.dtype))
+
+
 @stage
 def _closed(goal: Array, excess: Array, infeasibility: Array) -> Array:
     """Whether the gap is small enough, and what is left is to meet the constraints to rounding."""
-    return (excess <= goal) & (infeasibility <= ALMOST)
+    return (excess <= goal) & _almost(infeasibility)
 
 
 @stage
@@ -166,7 +171,7 @@ def _next_state(
     """The state after a step; why the lanes that stop here do so."""
     running = state.stop == Status.RUNNING.value
     slow = STALL.slow(now.excess, state.excess) & STALL.slow(now.infeasibility, state.infeasibility)
-    slow = slow & (now.infeasibility < ALMOST) & running
+    slow = slow & _almost(now.infeasibility) & running
     stalled = STALL.count(slow, state.stalled)
     met = now.infeasibility <= jnp.maximum(0.1 * interior.primal, rounding * (1 + interior.largest))
     sound = (interior.primal > 0) & (interior.dual > 0)

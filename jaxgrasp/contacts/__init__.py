@@ -38,7 +38,7 @@ from .projection import (
     to_twist,
 )
 from .tiled_derivatives import BatchAxes, filled, masked, safe_contacts, tiled, tiled_solver, zero_tangent
-from .validity import is_grasp, sound
+from .validity import is_grasp, nonzero, sound
 
 __all__ = [
     "Axes",
@@ -76,6 +76,7 @@ __all__ = [
     "minus_transposed",
     "model_name",
     "nearest_admissible",
+    "nonzero",
     "normal_first",
     "normalized",
     "null_space",

@@ -12,7 +12,7 @@ from jax import lax
 from ..core import Array, Bool, size_limit
 from .grasp import Grasp
 
-__all__ = ["is_grasp", "sound"]
+__all__ = ["is_grasp", "nonzero", "sound"]
 
 
 def _magnitude(coordinates: tuple[Array, ...]) -> Array:
@@ -22,7 +22,7 @@ def _magnitude(coordinates: tuple[Array, ...]) -> Array:
     return size
 
 
-def _nonzero(x: Array) -> Array:
+def nonzero(x: Array) -> Array:
     """``x != 0``, also where a processor takes denormal numbers for 0: by the bits but for the sign."""
     return lax.bitcast_convert_type(x, jnp.uint64 if x.dtype == jnp.float64 else jnp.uint32) << 1 != 0
 
@@ -50,7 +50,7 @@ def sound(
         usable = usable & jnp.isfinite(x)
     usable = usable & (_magnitude(normal) >= least)
     reach = jnp.where(active, _magnitude(position), jnp.zeros_like(friction))
-    size, placed = largest(reach), reduce(jnp.logical_or, [largest(active & _nonzero(x)) for x in position])
+    size, placed = largest(reach), reduce(jnp.logical_or, [largest(active & nonzero(x)) for x in position])
     spin = largest(jnp.where(active, torsion, jnp.zeros_like(torsion)))
     length = jnp.where(placed, size, jnp.ones_like(size))
     sized = (length >= 1 / limit) & (length <= limit) & (spin <= limit * length)

@@ -91,12 +91,13 @@ def normalize(v: Float[Array, "*batch d"]) -> Float[Array, "*batch d"]:
     return jnp.stack(normalize_components(components(v)), axis=-1)
 
 
-def frame_components(normal: Components) -> tuple[Components, ...]:
-    """``contact_frame`` on tuples of coordinates."""
+def frame_components(normal: Components, sign: Array | None = None) -> tuple[Components, ...]:
+    """``contact_frame`` on tuples of coordinates; ``sign`` of n_z (1 for 0) where they are no plain arrays."""
     if len(normal) == 2:
         return ((normal[1], -normal[0]),)
     x, y, z = normal
-    sign = jnp.where(z >= 0, jnp.ones_like(z), -jnp.ones_like(z))
+    if sign is None:
+        sign = jnp.where(z >= 0, jnp.ones_like(z), -jnp.ones_like(z))
     a = -1 / (sign + z)
     b = x * y * a
     return (1 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)

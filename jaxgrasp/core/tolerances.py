@@ -14,6 +14,7 @@ __all__ = [
     "edge_tolerance",
     "gap_floor",
     "gap_goal",
+    "load_limit",
     "largest_response",
     "pivot_tolerance",
     "perturbation_tolerance",
@@ -123,6 +124,14 @@ def size_limit(dtype) -> float:
     Products of four such numbers neither over- nor underflow.
     """
     return 2.0 ** (np.finfo(jnp.dtype(dtype)).maxexp // 4)
+
+
+def load_limit(dtype) -> float:
+    """Loads in N (torques over L) lie between this and its inverse: 2^510 (float64), 2^62 (float32).
+
+    Their squares neither over- nor underflow.
+    """
+    return 2.0 ** (np.finfo(jnp.dtype(dtype)).maxexp // 2 - 2)
 
 
 def proven_limit(dtype) -> float:

@@ -49,12 +49,15 @@ class Answer(NamedTuple):
 class Values(NamedTuple):
     """A criterion between its bound and its cost (L,), in the caller's units.
 
-    bound  without what rounding can do to it      scale   the objective, what the gap is relative to
+    scale  the objective, what the gap is relative to      rounding   what evaluating the bound can lose
+    stored  what it can lose when it is evaluated from the twist of A, as it is stored
     """
 
     cost: Array
     bound: Array
     scale: Array
+    rounding: Array
+    stored: Array
 
 
 class Proofs(NamedTuple):
@@ -112,7 +115,7 @@ def _status(
     lanes: Lanes, values: Values, proofs: Proofs, violation: Array, smoothing: Array | None,
     tolerance: Array, edge: float,
 ) -> Array:  # fmt: skip
-    cost, bound = values.cost, values.bound
+    cost, bound = values.cost, values.bound - values.rounding
     tight = (cost - bound) <= tolerance * jnp.maximum(values.scale, jnp.abs(cost))
     if smoothing is not None:  # the answer is a point of the central path, at a gap of its own
         tight = lanes.stop == Status.CONVERGED.value
@@ -153,12 +156,14 @@ def answer(problem: ForceProblem, state: ConvexState, tolerance: Array) -> Answe
 
 
 def _values(problem: ForceProblem, point: ConvexPoint, u: Cone, found: Multipliers) -> Values:
+    rows = found.rows
     program, size, barrier = problem.program, problem.load.size, problem.demand.barrier()
     cost = criterion_value(program, u, size, barrier)
-    bound = dual_value(program, found.rows, u, size, barrier)
+    bound = dual_value(program, rows, u, size, barrier)
     bound = jnp.where(jnp.isnan(bound), -jnp.inf, bound)
-    rounding = _rounding(problem.tile.folded, program, found.twist, found.rows, u, problem.load)
-    return Values(cost, bound - rounding, _scale(program, point, size))
+    rounding = _rounding(program, rows, u, size)
+    stored = rounding + _stored(problem.tile.folded, program, found, u, problem.load)
+    return Values(cost, bound, _scale(program, point, size), rounding, stored)
 
 
 def _proofs(problem: ForceProblem, found: Multipliers) -> Proofs:
@@ -182,22 +187,25 @@ def _to_size_one(ray: Array) -> Array:
 
 
 @stage
-def _rounding(folded: Folded, program: ConvexConeProgram, twist: Array, rows: Array, u: Cone, load: Load) -> Array:
-    """What rounding can do to the bound of these multipliers, evaluated again from the twist of A as it is given."""
-    m, joints = program.rhs.shape[0], rows.shape[0] - program.rhs.shape[0]
+def _rounding(program: ConvexConeProgram, rows: Array, u: Cone, size: Array) -> Array:
+    """What rounding can do to the bound of multipliers as large as ``rows``."""
     forces = jnp.sqrt(cone_sum(program.exists * inner(u, u)))
-    blur = folded.norm * vector_norm(twist) * forces * load.size + vector_norm(twist) * vector_norm(load.wrench)
+    blur = vector_norm(rows) * (vector_norm(program.rhs) + forces) * size
+    blur = jnp.asarray(8 * unit_roundoff(blur.dtype), blur.dtype) * blur
+    return blur * size if program.curvature is not None else blur
+
+
+@stage
+def _stored(folded: Folded, program: ConvexConeProgram, found: Multipliers, u: Cone, load: Load) -> Array:
+    """What it can lose when it is evaluated again from the twist of A, with all rounding allowed for."""
+    m, joints = program.rhs.shape[0], found.rows.shape[0] - program.rhs.shape[0]
+    forces, speed = jnp.sqrt(cone_sum(program.exists * inner(u, u))), vector_norm(found.twist)
+    blur = folded.norm * speed * forces * load.size + speed * vector_norm(load.wrench)
     if joints:
-        beta = vector_norm(rows[m:])
-        square = [cone_sum(program.exists * inner(c, c)) for c in _joint_columns(program, m)]
-        blur = blur + beta * jnp.sqrt(reduce(jnp.add, square)) * forces * load.size
+        square = [cone_sum(inner(*[tuple(c[j] for c in program.columns)] * 2)) for j in range(m, m + joints)]
+        blur = blur + vector_norm(found.rows[m:]) * jnp.sqrt(reduce(jnp.add, square)) * forces * load.size
     blur = jnp.asarray((32 + len(u) + joints) * unit_roundoff(blur.dtype), blur.dtype) * blur
     return blur * load.size if program.curvature is not None else blur
-
-
-def _joint_columns(program: ConvexConeProgram, m: int) -> list[Cone]:
-    """The rows of E, one a joint."""
-    return [tuple(c[j] for c in program.columns) for j in range(m, program.columns[0].shape[0])]
 
 
 @stage
@@ -211,6 +219,7 @@ def _in_user_units(
 ) -> Answer:
     """Newtons and metres; zeros, infinities and NaN where the status says so."""
     tile, squared = problem.tile, problem.program.curvature is not None
+    unbarred = problem.demand.criterion.barrier_weight is None
 
     @stage
     def run(
@@ -218,7 +227,10 @@ def _in_user_units(
         row_norm: Array | None, coefficients: tuple[Array, Array],
     ) -> tuple[Array, ...]:  # fmt: skip
         optimal, infeasible = status == Status.OPTIMAL.value, status == Status.INFEASIBLE.value
-        invalid, cost, bound = status == Status.INVALID.value, values.cost, values.bound
+        invalid, cost = status == Status.INVALID.value, values.cost
+        bound = jnp.where(jnp.isfinite(values.stored), values.bound - values.stored, -jnp.inf)
+        if unbarred:  # no forces cost less than 0
+            bound = jnp.maximum(bound, jnp.minimum(values.bound, jnp.zeros_like(bound)))
         m = found.twist.shape[0]
         nan, inf = jnp.full_like(cost, jnp.nan), jnp.full_like(cost, jnp.inf)
         zero = jnp.zeros_like(cost)

@@ -21,13 +21,15 @@ from ..conic import (
     ConvexConeProgram,
     Curvature,
     cone_all,
+    cone_any,
+    cone_max,
     null_combination,
     residual_lower,
     solve_lower,
     vector_norm,
 )
-from ..contacts import Component, Contacts, Tile, normal_first
-from ..core import Array, unit_roundoff
+from ..contacts import Component, Contacts, Tile, nonzero, normal_first
+from ..core import Array, load_limit, unit_roundoff
 from .bounds import Barrier
 from .criteria import Criterion
 
@@ -92,9 +94,11 @@ class ForceProblem(NamedTuple):
 
 @stage
 def _scaled_wrench(force: Array, torque: Array, length: Array) -> tuple[Array, Array]:
-    """(force; torque / L), and whether it is finite."""
-    rows = jnp.concatenate([force, torque / length])
-    finite = cone_all(jnp.isfinite(rows))
+    """(force; torque / L), and whether it is a load: 0, or of a size whose square neither over- nor underflows."""
+    rows, limit = jnp.concatenate([force, torque / length]), load_limit(force.dtype)
+    size = cone_max(jnp.abs(rows))
+    fits = (size >= 1 / limit) & (size <= limit)
+    finite = fits | ~cone_any(nonzero(jnp.concatenate([force, torque])))
     return jnp.where(finite, rows, jnp.zeros_like(rows)), finite
 
 

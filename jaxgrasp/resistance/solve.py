@@ -60,6 +60,7 @@ from ..core import (
 )
 from .derivatives import Scales, Solved, differentiable
 from .problem import Start, margin_program, starting_point
+from .second_attempt import second_attempt
 from .verdict import Rank, Verdict, judge, unnoticed
 
 __all__ = ["WrenchResistance", "wrench_resistance"]
@@ -311,6 +312,22 @@ def _solve_rows(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array)
     return Solved(verdict, state.iterations, state.stop, point, scales)
 
 
+def _second_rows(plan: _Plan, contacts: Contacts, first: Verdict, tolerance: Array) -> Verdict:
+    """``first`` with a second attempt at the rows it leaves undecided.
+
+    No kernel: the sums of pairs are reductions, which a kernel cannot hold, and few rows come here.
+    """
+
+    def run(rows: tuple[Contacts, Verdict]) -> Verdict:
+        contacts, first = rows[0], jax.tree.map(to_lanes, rows[1])
+        length = fold(contacts, plan.components).length
+        found = second_attempt(plan.components, plan.dimension, contacts, length, first, tolerance)
+        return jax.tree.map(to_rows, found)
+
+    undecided = first.status == Status.UNDECIDED.value
+    return map_selected(run, undecided, (contacts, first), first, plan.width)
+
+
 def _answer(solved: Solved) -> WrenchResistance:
     found = solved.verdict
     rank = jnp.where(jnp.isnan(found.rank), -1, found.rank).astype(jnp.int32)
@@ -329,7 +346,11 @@ def _answer(solved: Solved) -> WrenchResistance:
 
 @functools.cache
 def _compiled(plan: _Plan) -> Callable[..., WrenchResistance]:
-    solve = batched(functools.partial(_solve_rows, plan), lambda rows: rows.active.shape[:-1], plan.width)
+    def rows(contacts: Contacts, count: Array, tolerance: Array) -> Solved:
+        solved = _solve_rows(plan, contacts, count, tolerance)
+        return solved._replace(verdict=_second_rows(plan, contacts, solved.verdict, tolerance))
+
+    solve = batched(rows, lambda rows: rows.active.shape[:-1], plan.width)
     run = differentiable(solve, plan.components, not plan.verdict_only, plan.width)
 
     def result(contacts: Contacts, tolerance: Array) -> WrenchResistance:
@@ -340,13 +361,23 @@ def _compiled(plan: _Plan) -> Callable[..., WrenchResistance]:
 
 
 @functools.partial(jax.jit, static_argnames=("plan",))
-def _solve_chunk(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array) -> WrenchResistance:
-    return _answer(_solve_rows(plan, contacts, count, tolerance))
+def _solve_chunk(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array) -> Solved:
+    return _solve_rows(plan, contacts, count, tolerance)
+
+
+@functools.partial(jax.jit, static_argnames=("plan",))
+def _second_chunk(plan: _Plan, contacts: Contacts, first: Verdict, tolerance: Array) -> Verdict:
+    return _second_rows(plan, contacts, first, tolerance)
 
 
 def _solve_on_host(plan: _Plan, contacts: Contacts, tolerance: Array) -> WrenchResistance:
+    """The same programs one after the other, so that the second is compiled only where a lane needs it."""
+
     def solve(rows: Contacts, count: Array) -> WrenchResistance:
-        return _solve_chunk(plan, rows, count, tolerance)
+        solved = _solve_chunk(plan, rows, count, tolerance)
+        if np.any(np.asarray(solved.verdict.status) == Status.UNDECIDED.value):
+            solved = solved._replace(verdict=_second_chunk(plan, rows, solved.verdict, tolerance))
+        return _answer(solved)
 
     return in_chunks(solve, contacts, contacts.active.shape[:-1], CHUNK)
 

@@ -164,16 +164,19 @@ def _primal_evidence(tile: Tile, rank: Rank, full_rank: Array, u: Cone) -> Prima
     known = room > 0
     safe = jnp.where(known, room, one)
     shift = jnp.sqrt(2 * one) * (residual + rounding * folded.norm * size) / safe
-    # The exact internal force lies within near / 2 of s.
-    near = 2 * jnp.sqrt(2 * one) * (residual + _evaluation(s) * folded.norm * size) / safe
-    near = jnp.where(known, near + 8 * eps * size, jnp.inf * one)
+    # The exact internal force lies within half of this of s; its mean normal force is 1 to within ``drift``.
+    distance = 2 * (residual + _evaluation(folded) * folded.norm * size) / safe + 4 * eps * size
+    drift = distance / jnp.sqrt(folded.count)
+    near = 2 * (distance + jnp.abs(slack) * drift)
+    meant = jnp.abs(cone_sum(s[0]) - folded.count) < 0.5  # not so where s had no mean to be scaled by
+    near = jnp.where(known & meant & (drift < 0.5), near, jnp.inf * one)
     return Primal(s, slack, near, full_rank & known & (shift < slack))
 
 
-def _evaluation(s: Cone) -> float:
+def _evaluation(folded: Folded) -> Array:
     """Rounding of ``A s`` over |A| |s| in the working dtype, and what a float64 checker with proven bounds allows."""
-    terms = len(s) * s[0].shape[0]
-    return max(4 * unit_roundoff(s[0].dtype), (terms + 16) * unit_roundoff("float64"))
+    terms = len(folded.columns) * folded.count
+    return jnp.maximum(4 * unit_roundoff(terms.dtype), (terms + 16) * unit_roundoff("float64"))
 
 
 def _dual_evidence(tile: Tile, rank: Rank, full_rank: Array, y: Array) -> Dual:
@@ -188,7 +191,7 @@ def _dual_evidence(tile: Tile, rank: Rank, full_rank: Array, y: Array) -> Dual:
     xi = _unit_twist(to_twist(tile.projection, opposing))
     x, size = _velocities(folded.columns, folded.exists, xi)
     escapes = _escape_depth(folded.exists, x, size, _rounding(folded)) > 0
-    upper = bound_of(folded, x, _evaluation(x) * size)
+    upper = bound_of(folded, x, _evaluation(folded) * size)
     deficient = ~full_rank & unnoticed(rank)
     use_null = deficient & ~escapes
     return Dual(upper, xi, jnp.where(use_null, rank.null_twist, xi), escapes, deficient)
@@ -198,9 +201,7 @@ def _bracket(primal: Primal, dual: Dual) -> Bracket:
     eps = unit_roundoff(primal.slack.dtype)
     blur = 16 * eps * (1 + jnp.abs(primal.slack) + jnp.abs(dual.upper))
     lower, upper = primal.slack - blur - primal.near, dual.upper + blur
-    # Rounding must not turn the bracket round.
-    lower, upper = jnp.minimum(lower, upper), jnp.maximum(lower, upper)
-    return Bracket(lower, upper, blur)
+    return Bracket(jnp.minimum(lower, upper), upper, blur)  # rounding must not turn the bracket round
 
 
 def _status(
