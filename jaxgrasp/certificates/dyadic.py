@@ -56,7 +56,7 @@ class ExactGrasp(NamedTuple):
     """The contacts of a grasp that count, as integers; planar ones lie in the plane z = 0.
 
     position, normal  triples      normal_square  |N_i|^2      friction, torsion  mu_i, gamma_i
-    length_exponent, friction_exponent  powers of two of (p, gamma) and of mu
+    length_exponent, normal_exponent, friction_exponent  powers of two of (p, gamma), of each normal, and of mu
     """
 
     dimension: int
@@ -66,6 +66,7 @@ class ExactGrasp(NamedTuple):
     friction: list[int]
     torsion: list[int]
     length_exponent: int
+    normal_exponent: list[int]
     friction_exponent: int
 
     @property
@@ -167,10 +168,11 @@ def exact_grasp(
 
     lengths, exponent = integers([*position.ravel(), *torsion])
     points = [triple(lengths[d * i : d * i + d]) for i in range(k)]
-    normals = [triple(integers(row)[0]) for row in normal]
+    rows = [integers(row) for row in normal]
+    normals = [triple(numbers) for numbers, _ in rows]
     mu, mu_exponent = integers(friction)
     squares = [dot(n, n) for n in normals]
-    return ExactGrasp(d, points, normals, squares, mu, lengths[d * k :], exponent, mu_exponent)
+    return ExactGrasp(d, points, normals, squares, mu, lengths[d * k :], exponent, [e for _, e in rows], mu_exponent)
 
 
 def twist_of(grasp: ExactGrasp, numbers: np.ndarray) -> Twist:

@@ -14,7 +14,7 @@ from .elimination import null_vector, solve
 from .enclosures import root_above, root_below
 from .exact_force import Scaled
 
-__all__ = ["escape_twist", "margin_at_most", "moves_all_alike", "rounding_distance"]
+__all__ = ["escape_twist", "margin_at_most", "moves_all_alike", "rounding_distance", "without_pitch"]
 
 UNSEEN = 1e-9  # of its size: a contact that a twist moves by less may not move at all
 EDGE = 1e-6  # of its size: a contact this near the edge of its cone is pushed inwards
@@ -146,22 +146,24 @@ def rounding_distance(grasp: ExactGrasp, lane: Scaled, xi: np.ndarray, friction:
     Positions over the length, angles of the normals, mu, gamma over the length; the largest of all. The twist is
     first freed of its translation along its own axis, so that a contact can be moved to where it does not notice it.
     """
-    d = grasp.dimension
-    exact = twist_of(grasp, _physical(lane, d, xi))
-    square = dot(exact.rotation, exact.rotation)
-    if square:
-        pitch = dot(exact.velocity, exact.rotation)
-        exact = Twist(
-            [square * v - pitch * w for v, w in zip(exact.velocity, exact.rotation, strict=True)],
-            [square * w for w in exact.rotation],
-        )
-    elif not any(exact.velocity):
+    exact = without_pitch(grasp, lane, xi)
+    if not (any(exact.velocity) or any(exact.rotation)):
         return np.inf
     worst = 0.0
     for i in grasp.contacts:
         if grasp.opposes(i, exact):
             worst = max(worst, _contact_distance(grasp, lane, exact, i, float(friction[i])))
     return worst
+
+
+def without_pitch(grasp: ExactGrasp, lane: Scaled, xi: np.ndarray) -> Twist:
+    """The twist freed of its translation along its own axis, ``v . omega = 0`` exactly, times a positive number."""
+    twist = twist_of(grasp, _physical(lane, grasp.dimension, xi))
+    square, pitch = dot(twist.rotation, twist.rotation), dot(twist.velocity, twist.rotation)
+    if not square:
+        return twist
+    velocity = [square * v - pitch * w for v, w in zip(twist.velocity, twist.rotation, strict=True)]
+    return Twist(velocity, [square * w for w in twist.rotation])
 
 
 def _root(value: Fraction) -> float:

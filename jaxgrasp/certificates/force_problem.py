@@ -81,6 +81,11 @@ def _repeated(known: Rebuilt, loads: int) -> Rebuilt:
     return known._replace(**{name: np.repeat(x, loads, axis=0) for name, x in arrays.items()})
 
 
+def _load_limit(dtype: np.dtype) -> float:
+    """Loads in N (torques over L) are 0 or between this and its inverse, so that squares neither over- nor underflow."""
+    return 2.0 ** (np.finfo(dtype).maxexp // 2 - 2)
+
+
 def _power_of_two(size: np.ndarray) -> np.ndarray:
     """Near ``size``; 1 where it is no size."""
     usable = np.isfinite(size) & (size > 0)
@@ -129,8 +134,11 @@ def force_problem(grasp, problem) -> ForceProblem:
 
     with np.errstate(all="ignore"):
         load = scaled_wrench(wrench, known.length, dimension)
+        size = np.max(np.abs(load), -1, initial=0.0)
+        limit = _load_limit(np.dtype(grasp.position.dtype))
+        valid &= ((size >= 1 / limit) & (size <= limit)) | ~wrench.any(-1)
         weight = parameters["weight"]
-        unit = _power_of_two(np.max(np.abs(load), -1, initial=0.0))
+        unit = _power_of_two(size)
         if weight is not None:  # a barrier's logarithms are those of newtons
             unit = np.ones_like(unit)
         asked = Asked(

@@ -97,6 +97,25 @@ class Rebuilt(NamedTuple):
     normal_index: int
 
 
+def _sound(position, normal, friction, torsion, active, dtype: np.finfo) -> np.ndarray:
+    """(N,) which numbers are a grasp.
+
+    Those of active contacts, at least one, are finite, the largest component of a normal is no denormal number, mu and
+    gamma are at least 0; and the sizes are such that products neither over- nor underflow in the dtype: with
+    S = 2^256 (float64), 2^32 (float32) and P the largest |component| of a position, P is 0 or in [1/S, S], mu <= S,
+    gamma <= S P (<= S for P = 0).
+    """
+    limit = 2.0 ** (dtype.maxexp // 4)
+    usable = np.isfinite(position).all(-1) & np.isfinite(normal).all(-1)
+    usable &= np.max(np.abs(normal), -1) >= float(dtype.tiny)
+    usable &= (friction >= 0) & (friction <= limit) & (torsion >= 0)
+    largest = np.max(np.where(active[..., None], np.abs(position), 0.0), (-1, -2), initial=0.0)
+    length = np.where(largest > 0, largest, 1.0)
+    spin = np.max(np.where(active, torsion, 0.0), -1, initial=0.0)
+    sized = (length >= 1 / limit) & (length <= limit) & (spin <= limit * length)
+    return (usable | ~active).all(-1) & active.any(-1) & sized
+
+
 def rebuild(grasp) -> Rebuilt:
     """The folded grasp map of every lane, from the numbers that define the grasp."""
     k, dimension = grasp.position.shape[-2], grasp.position.shape[-1]
@@ -114,9 +133,7 @@ def rebuild(grasp) -> Rebuilt:
     active = lanes(grasp.active, k)
     with np.errstate(all="ignore"):
         size = np.max(np.abs(normal), -1)
-        usable = np.isfinite(position).all(-1) & np.isfinite(normal).all(-1) & (size > 0)
-        usable &= np.isfinite(friction) & np.isfinite(torsion) & (friction >= 0) & (torsion >= 0)
-        valid = (usable | ~active).all(-1) & active.any(-1)
+        valid = _sound(position, normal, friction, torsion, active, np.finfo(np.dtype(grasp.position.dtype)))
         live = active & valid[:, None]
         given = np.where(live[..., None], normal, 0.0)
         normal = np.where(

@@ -21,17 +21,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .dyadic import exact_grasp
-from .elimination import independent
-from .enclosures import DIGITS
-from .exact_force import internal_force, margin_at_least, scaled_lane
-from .exact_twist import escape_twist, margin_at_most, moves_all_alike, rounding_distance
+from .exact_lane import ExactLane
 from .proof import LEVELS, Proof
 from .rank import numeric_rank_fits, rounding_of, smallest_singular_value
 from .reading import Fields
 from .rebuilt import EPS, Rebuilt, rebuild, scaled_force, scaled_twist
 
-__all__ = ["prove_resistance"]
+__all__ = ["claim_of", "of_size_one", "prove_resistance"]
 
 RESISTANT, NOT_RESISTANT, MARGINAL, UNDECIDED, INVALID = 1, 2, 3, 4, 5
 NEARBY = 64.0  # eps: how far numbers may lie of which a proof to rounding speaks
@@ -65,13 +61,11 @@ class Facts(NamedTuple):
     at_most: np.ndarray
 
 
-def prove_resistance(grasp, answer, tolerance: float | None = None) -> Proof:
-    """What the evidence of ``answer`` proves of ``grasp``; shapes (*batch,)."""
-    batch, k, dimension = grasp.position.shape[:-2], grasp.position.shape[-2], grasp.position.shape[-1]
-    m, known = 3 if dimension == 2 else 6, rebuild(grasp)
-    n = len(known.components)
-    said = Fields(answer, batch)
-    claim = Claim(
+def claim_of(grasp, answer, known: Rebuilt) -> Claim:
+    """What the answer says, as it stands; Malformed where it is none."""
+    batch, k, n = grasp.position.shape[:-2], *known.scale.shape[1:]
+    m, said = 3 if grasp.position.shape[-1] == 2 else 6, Fields(answer, batch)
+    return Claim(
         status=said.numbers("status"),
         rank=said.numbers("rank"),
         lower=said.numbers("lower"),
@@ -80,6 +74,12 @@ def prove_resistance(grasp, answer, tolerance: float | None = None) -> Proof:
         escape=said.numbers("escape_twist", m),
         bound=said.numbers("bound_twist", m),
     )
+
+
+def prove_resistance(grasp, answer, tolerance: float | None = None) -> Proof:
+    """What the evidence of ``answer`` proves of ``grasp``; shapes (*batch,)."""
+    batch, dimension, known = grasp.position.shape[:-2], grasp.position.shape[-1], rebuild(grasp)
+    claim = claim_of(grasp, answer, known)
     eps = float(np.finfo(np.dtype(grasp.position.dtype)).eps)
     parts = [
         _proved(_part(known, lanes), _part(claim, lanes), dimension, eps, tolerance)
@@ -110,19 +110,24 @@ def _unit(x: np.ndarray) -> np.ndarray:
     return (flat / np.linalg.norm(flat, axis=-1, keepdims=True)).reshape(x.shape)
 
 
+def of_size_one(known: Rebuilt, claim: Claim, dimension: int) -> Claim:
+    """Evidence scaled as A wants it, and brought to size 1."""
+    with np.errstate(all="ignore"):
+        live = known.live[..., None]
+        s = scaled_force(_unit(np.where(live, claim.s, 0.0)), known.scale, known.normal_index)
+        return claim._replace(
+            s=_unit(np.where(live, s, 0.0)),
+            escape=_unit(scaled_twist(_unit(claim.escape), known.length, dimension)),
+            bound=_unit(scaled_twist(_unit(claim.bound), known.length, dimension)),
+        )
+
+
 def _proved(
     known: Rebuilt, claim: Claim, dimension: int, eps: float, tolerance: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Levels 0, 1, 2 and distances (N,)."""
     with np.errstate(all="ignore"):
-        live = known.live[..., None]
-        s = scaled_force(_unit(np.where(live, claim.s, 0.0)), known.scale, known.normal_index)
-        s = np.where(live, s, 0.0)
-        claim = claim._replace(
-            s=_unit(s),
-            escape=_unit(scaled_twist(_unit(claim.escape), known.length, dimension)),
-            bound=_unit(scaled_twist(_unit(claim.bound), known.length, dimension)),
-        )
+        claim = of_size_one(known, claim, dimension)
         facts = _facts(known, claim)
         fits = numeric_rank_fits(known.A, claim.rank, facts.sigma, eps)
         marginal = _marginal(claim, tolerance, eps)
@@ -136,11 +141,11 @@ def _proved(
     )
     done = verdict & facts.at_least & facts.at_most
     level, distance = np.where(sound & done, 2, 0), np.zeros(len(sound))
-    for lane in np.flatnonzero(sound & ~done):
-        open_lane = _Lane(known, claim, lane, dimension, NEARBY * eps)
-        level[lane], distance[lane] = open_lane.proved(
-            bool(verdict[lane]), bool(facts.at_least[lane]), bool(facts.at_most[lane])
-        )
+    for i in np.flatnonzero(sound & ~done):
+        lane = ExactLane(known, i, dimension, claim.s[i], claim.escape[i], claim.bound[i], NEARBY * eps)
+        proved = bool(verdict[i]), bool(facts.at_least[i]), bool(facts.at_most[i])
+        ends = float(claim.lower[i]), float(claim.upper[i])
+        level[i], distance[i] = _exactly(lane, int(claim.status[i]), ends, not full[i], proved)
     nothing = np.isnan(claim.lower) & np.isnan(claim.upper) & (claim.rank == -1)
     level[~known.valid & (claim.status == INVALID) & nothing] = 2
     return level, distance
@@ -205,77 +210,29 @@ def _marginal(claim: Claim, tolerance: float | None, eps: float) -> np.ndarray:
     return largest <= 2 * max(float(tolerance), resolution)
 
 
-class _Lane:
-    """One lane in integers."""
+def _exactly(
+    lane: ExactLane, status: int, ends: tuple[float, float], deficient: bool, proved: tuple[bool, bool, bool]
+) -> tuple[int, float]:
+    """Level and distance of one lane; ``proved``: verdict, lower and upper, as far as floating point has them.
 
-    def __init__(self, known: Rebuilt, claim: Claim, lane: int, dimension: int, nearby: float):
-        live = known.live[lane]
-        self.claim, self.lane, self.nearby = claim, lane, nearby
-        self.friction = known.friction[lane][live]
-        self.grasp = exact_grasp(
-            known.position[lane][live], known.normal[lane][live], self.friction, known.torsion[lane][live]
-        )
-        self.scaled = scaled_lane(known, lane, dimension)
-        self.s = claim.s[lane][live]
-
-    def proved(self, verdict: bool, at_least: bool, at_most: bool) -> tuple[int, float]:
-        """Level and distance, with what floating point proved already."""
-        claim, lane, status = self.claim, self.lane, int(self.claim.status[self.lane])
-        lower, upper = float(claim.lower[lane]), float(claim.upper[lane])
-        rows, distance = len(self.grasp.rows), 0.0
-        forces = None
-        if not at_least or (status == RESISTANT and not verdict) or (status == MARGINAL and not verdict):
-            forces = internal_force(self.grasp, self.scaled, self.s)
-            full = forces is not None and forces[1] == rows
-            if status == RESISTANT:
-                verdict = full and self.grasp.strictly_inside(forces[0])
-            elif status == MARGINAL:
-                verdict = full
-        if status == NOT_RESISTANT and not verdict and np.isfinite(claim.escape[lane]).all():
-            verdict = escape_twist(self.grasp, self.scaled, claim.escape[lane]) is not None
-            if not verdict:
-                distance = rounding_distance(self.grasp, self.scaled, claim.escape[lane], self.friction)
-                verdict = distance <= self.nearby
+    ends       lower and upper      deficient  the rank is not full
+    """
+    (lower, upper), (verdict, at_least, at_most), distance = ends, proved, 0.0
+    if not verdict and status == RESISTANT:
+        verdict = lane.resistant
+    elif not verdict and status == MARGINAL:
+        verdict = lane.full_rank
+    elif not verdict:
+        verdict = lane.escape is not None
         if not verdict:
-            return 0, np.inf
-        low = at_least or (
-            forces is not None and any(margin_at_least(self.grasp, forces[0], lower, d) for d in DIGITS)
-        )
-        deficient = claim.rank[lane] < rows
-        if not low and deficient:
-            low, distance = self._lower_by_rounding(lower, distance)
-        high = at_most or (
-            self._nothing_normal()
-            if upper == -np.inf
-            else np.isfinite(claim.bound[lane]).all()
-            and any(margin_at_most(self.grasp, self.scaled, claim.bound[lane], upper, d) for d in DIGITS)
-        )
-        if not high:
-            high, distance = self._upper_by_rounding(upper, distance)
-        if not (low and high):
-            return 0, np.inf
-        return (2, 0.0) if distance == 0.0 else (1, distance)
-
-    def _nothing_normal(self) -> bool:
-        """No internal force has a normal component, exactly: t* = -inf."""
-        return independent(self.grasp.unit_wrenches()[0]) or moves_all_alike(self.grasp)
-
-    def _lower_by_rounding(self, lower: float, distance: float) -> tuple[bool, float]:
-        """Some map within ``residual / (|A| |s|)`` of A, relatively, has the internal force s itself."""
-        s, A = self.s, self.scaled.A
-        if not np.isfinite(s).all():
-            return False, distance
-        residual = float(np.linalg.norm(A @ s.ravel()) / np.linalg.norm(A)) + A.shape[1] * EPS
-        tails, total = np.linalg.norm(s[:, 1:], axis=-1), float(s[:, 0].sum())
-        shown = len(s) * float(np.min(s[:, 0] - tails)) / total if total > 0 else -np.inf
-        holds = residual <= self.nearby and shown >= lower - self.nearby
-        return holds, max(distance, residual)
-
-    def _upper_by_rounding(self, upper: float, distance: float) -> tuple[bool, float]:
-        """t* = -inf of an A within rounding: the twist moves all contacts alike, along their normals."""
-        if upper != -np.inf or not np.isfinite(self.claim.bound[self.lane]).all():
-            return False, distance
-        x = (self.scaled.A.T @ self.claim.bound[self.lane]).reshape(self.s.shape)
-        mean = float(x[:, 0].mean())
-        off = max(float(np.abs(x[:, 0] - mean).max()), float(np.abs(x[:, 1:]).max(initial=0.0)))
-        return mean > 0 and off <= self.nearby * mean, max(distance, off)
+            distance = lane.distance
+            verdict = distance <= lane.nearby
+    if not verdict:
+        return 0, np.inf
+    if not (at_least or lane.at_least(lower)):
+        distance = max(distance, lane.at_least_nearby(lower) if deficient else np.inf)
+    if not (at_most or lane.at_most(upper)):
+        distance = max(distance, lane.at_most_nearby(upper))
+    if distance > lane.nearby:
+        return 0, np.inf
+    return (2, 0.0) if distance == 0.0 else (1, distance)

@@ -1,0 +1,106 @@
+"""One grasp and its evidence in exact arithmetic: what floating point left open, and what a written proof holds."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from .dyadic import ForceSet, Twist, exact_grasp
+from .elimination import independent
+from .enclosures import DIGITS
+from .exact_force import internal_force, margin_at_least, scaled_lane
+from .exact_twist import escape_twist, margin_at_most, moves_all_alike, rounding_distance, without_pitch
+from .rebuilt import EPS, Rebuilt
+
+__all__ = ["ExactLane"]
+
+
+class ExactLane:
+    """Lane ``lane`` of the grasps ``known``, and the evidence for it.
+
+    s (k, n)            an internal force near which an exact one is sought, scaled, |s| = 1
+    escape, bound (m,)  twists, lengths over L
+    nearby              how far numbers may lie of which a proof to rounding speaks
+    """
+
+    def __init__(
+        self, known: Rebuilt, lane: int, dimension: int, s: np.ndarray, escape: np.ndarray, bound: np.ndarray,
+        nearby: float,
+    ):  # fmt: skip
+        live = known.live[lane]
+        self.friction = known.friction[lane][live]
+        self.grasp = exact_grasp(
+            known.position[lane][live], known.normal[lane][live], self.friction, known.torsion[lane][live]
+        )
+        self.scaled, self.s = scaled_lane(known, lane, dimension), s[live]
+        self.twist, self.bound, self.nearby = escape, bound, nearby
+
+    @cached_property
+    def _balanced(self) -> tuple[ForceSet, int] | None:
+        return internal_force(self.grasp, self.scaled, self.s)
+
+    @property
+    def forces(self) -> ForceSet | None:
+        """Exact internal forces; None where there are none near."""
+        return None if self._balanced is None else self._balanced[0]
+
+    @property
+    def full_rank(self) -> bool:
+        """The contacts span all wrenches."""
+        return self._balanced is not None and self._balanced[1] == len(self.grasp.rows)
+
+    @property
+    def resistant(self) -> bool:
+        """Exact internal forces lie strictly inside every cone, and the contacts span all wrenches."""
+        return self.full_rank and self.forces is not None and self.grasp.strictly_inside(self.forces)
+
+    @cached_property
+    def escape(self) -> Twist | None:
+        """A twist that no contact can oppose, exactly."""
+        return escape_twist(self.grasp, self.scaled, self.twist) if np.isfinite(self.twist).all() else None
+
+    @cached_property
+    def distance(self) -> float:
+        """How far the numbers lie, at most, for which the twist escapes."""
+        if not np.isfinite(self.twist).all():
+            return np.inf
+        return rounding_distance(self.grasp, self.scaled, self.twist, self.friction)
+
+    @property
+    def without_pitch(self) -> Twist:
+        """The twist that escapes from numbers within ``distance``."""
+        return without_pitch(self.grasp, self.scaled, self.twist)
+
+    def at_least(self, lower: float) -> bool:
+        """Whether exact internal forces show ``t* >= lower``."""
+        if lower == -np.inf:
+            return True
+        forces = self.forces
+        return forces is not None and any(margin_at_least(self.grasp, forces, lower, d) for d in DIGITS)
+
+    def at_most(self, upper: float) -> bool:
+        """Whether the bound twist, or for -inf the contacts alone, show ``t* <= upper``."""
+        if upper == -np.inf:
+            return independent(self.grasp.unit_wrenches()[0]) or moves_all_alike(self.grasp)
+        known = np.isfinite(self.bound).all()
+        return bool(known) and any(margin_at_most(self.grasp, self.scaled, self.bound, upper, d) for d in DIGITS)
+
+    def at_least_nearby(self, lower: float) -> float:
+        """How far a map lies, relatively, that has the internal force s itself, if s shows ``lower``; else infinite."""
+        s, A = self.s, self.scaled.A
+        tails, total = np.linalg.norm(s[:, 1:], axis=-1), float(s[:, 0].sum())
+        if not (np.isfinite(s).all() and total > 0):
+            return np.inf
+        shown = len(s) * float(np.min(s[:, 0] - tails)) / total
+        residual = float(np.linalg.norm(A @ s.ravel()) / np.linalg.norm(A)) + A.shape[1] * EPS
+        return residual if shown >= lower - self.nearby else np.inf
+
+    def at_most_nearby(self, upper: float) -> float:
+        """How far a map lies of which the bound twist shows t* = -inf: it moves all contacts alike, along their normals."""
+        if upper != -np.inf or not np.isfinite(self.bound).all():
+            return np.inf
+        x = (self.scaled.A.T @ self.bound).reshape(self.s.shape)
+        mean = float(x[:, 0].mean())
+        off = max(float(np.abs(x[:, 0] - mean).max()), float(np.abs(x[:, 1:]).max(initial=0.0)))
+        return off / mean if mean > 0 else np.inf
