@@ -17,6 +17,7 @@ from .arrays import (
 )
 from .broadcast import spread
 from .errors import UserError
+from .files import check_file, open_archive, open_file, read_file, read_member
 from .geometry import (
     applied,
     contact_frame,
@@ -77,6 +78,7 @@ __all__ = [
     "as_array",
     "balance_tolerance",
     "bracket_width",
+    "check_file",
     "complementary_ratio",
     "contact_frame",
     "cross",
@@ -92,6 +94,8 @@ __all__ = [
     "largest_response",
     "normalize",
     "normalize_components",
+    "open_archive",
+    "open_file",
     "orientation_matrix",
     "part_of",
     "perturbation_tolerance",
@@ -99,6 +103,8 @@ __all__ = [
     "placed",
     "proven_limit",
     "rank_tolerance",
+    "read_file",
+    "read_member",
     "real_array",
     "require_precision",
     "renamed",
