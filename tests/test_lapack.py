@@ -19,6 +19,7 @@ import jaxgrasp as jg
 from jaxgrasp.conic import eigenvalues, left_svd, null_basis, pseudo_inverse, singular_values, solve
 from jaxgrasp.lmi import lmi_forces, lmi_margin
 from jaxgrasp.motion import Simulation, gramian
+from jaxgrasp.placement.objectives import EpsilonFloor
 from jaxgrasp.quality import grasp_isotropy, grasp_volume
 
 PACKAGE = Path(jg.__file__).parent
@@ -67,7 +68,9 @@ LIMITS = jg.TorqueLimits(np.eye(6)[:, :2], np.ones(2))
 
 
 def closed(grasp, controller):
-    return jg.close_loop(grasp, BODY, controller, STATE, Simulation(2, timestep=0.002))
+    return jg.close_loop(
+        grasp, BODY, controller=controller, state=STATE, simulation=Simulation(2, timestep=0.002)
+    )
 
 
 def regulated(grasp):
@@ -101,7 +104,7 @@ FREE = {
     "closed loop, regulated": regulated,
     "closed loop, computed torque": lambda g: closed(g, jg.ComputedTorque(jg.Gains.of_rate(25.0))),
     "a body's numbers": lambda g: (BODY.valid, BODY.inverse_inertia),
-    "placement's floor": lambda g: jg.placement.EpsilonFloor().value(g, ()),
+    "placement's floor": lambda g: EpsilonFloor().value(g, ()),
     "d radius": jax.grad(lambda g: jnp.sum(jg.guaranteed_radius(g).radius), allow_int=True),
     "d volume": jax.grad(lambda g: jnp.sum(grasp_volume(g)), allow_int=True),
     "d squeeze": jax.grad(lambda g: jnp.sum(jg.squeeze(g, LOAD).effort), allow_int=True),

@@ -16,6 +16,7 @@ from .arrays import (
     widened,
 )
 from .broadcast import spread
+from .claim import claimed
 from .errors import UserError
 from .files import check_file, open_archive, open_file, read_file, read_member
 from .geometry import (
@@ -79,6 +80,7 @@ __all__ = [
     "balance_tolerance",
     "bracket_width",
     "check_file",
+    "claimed",
     "complementary_ratio",
     "contact_frame",
     "cross",

@@ -38,6 +38,7 @@ def _coordinates(problem: LMIProblem, term: LogDetTerm, root: Array) -> _Coordin
     stacked = jnp.concatenate(
         [problem.matrices.reshape(N, -1), term.matrices.reshape(N, -1), root.T], axis=1
     ).T
+    stacked = after(stacked, problem.start)  # which may come from another problem
     length = jnp.linalg.norm(stacked, axis=0)
     length = jnp.where(length > 0, length, 1.0)
     _, values, rows = jnp.linalg.svd(stacked / length, full_matrices=False)
@@ -196,7 +197,8 @@ def minimize(problem: LMIProblem, goal: Array, max_steps: int = MAX_STEPS) -> LM
 def _minimize(problem: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
     """Follow the central path: a Newton step on phi_t; the bound it proves, if any; where x was central, raise t."""
     dtype, N = problem.cost.dtype, problem.cost.shape[-1]
-    root = jnp.zeros((1, N), dtype) if problem.curvature is None else _square_root(problem.curvature)
+    H = problem.curvature
+    root = jnp.zeros((1, N), dtype) if H is None else _square_root(after(H, problem.start))
     term = problem.log_det
     if term is None:  # B = 1: no cost
         term = LogDetTerm(jnp.zeros((), dtype), jnp.ones((1, 1), dtype), jnp.zeros((N, 1, 1), dtype))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..contacts import Grasp, component_names, contact_model
-from ..core import Status, UserError
+from ..core import Status, UserError, wrench_dimension
 
 __all__ = ["ForceAnswer", "StoredGrasp", "Verdict"]
 
@@ -27,6 +27,18 @@ class StoredGrasp:
     active: np.ndarray
     centre_of_mass: np.ndarray
     model: str
+
+    def __post_init__(self):
+        """UserError where the parts do not fit each other: the row of a damaged file."""
+        d, k = len(self.centre_of_mass), len(self.position)
+        for name, shape in self._shapes(k, d, len(self.components)).items():
+            value = getattr(self, name)
+            if value is not None and np.shape(value) != shape:
+                raise UserError(f"the row is damaged: {name} has the shape {np.shape(value)}, not {shape}")
+
+    def _shapes(self, k: int, d: int, n: int) -> dict[str, tuple[int, ...]]:
+        shapes: dict[str, tuple[int, ...]] = {"position": (k, d), "normal": (k, d)}
+        return shapes | dict.fromkeys(("friction", "torsion", "active"), (k,))
 
     @property
     def size(self) -> float:
@@ -72,13 +84,17 @@ class Verdict(StoredGrasp):
     twist: np.ndarray | None
     bound_twist: np.ndarray | None = None
 
+    def _shapes(self, k: int, d: int, n: int) -> dict[str, tuple[int, ...]]:
+        own = {"centre_of_mass": (3,), "force": (k, n), "twist": (6,), "bound_twist": (6,), "margin": (), "upper": (), "rank": ()}
+        return super()._shapes(k, 3, n) | own
+
     @classmethod
     def from_row(cls, row: dict[str, Any], metadata: dict[str, Any]) -> Verdict:
         """From what ``formats.parquet.read_row`` returns."""
         try:
             com, kind = np.asarray(metadata["centre_of_mass"], float), metadata["model"]["kind"]
             components = len(component_names(kind, 3))
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise UserError(
                 "the file's metadata lack the centre of mass or the model; screen it again"
             ) from error
@@ -86,24 +102,32 @@ class Verdict(StoredGrasp):
             status = Status(row["status"])
         except ValueError as error:
             raise UserError(f"the row's status, {row['status']}, is none that this jaxgrasp knows") from error
-        force = row["internal_force"]
-        position = np.asarray(row["position"], float).reshape(-1, 3)
-        return cls(
-            position=position,
-            normal=np.asarray(row["normal"], float).reshape(-1, 3),
-            friction=np.asarray(row["friction"], float),
-            torsion=np.asarray(row["torsion"], float),
-            active=np.asarray(row["active"], bool),
-            centre_of_mass=com,
-            model=kind,
-            status=status,
-            margin=float("nan") if row["margin"] is None else row["margin"],
-            upper=float("nan") if row["upper"] is None else row["upper"],
-            rank=row["rank"],
-            force=None if force is None else np.asarray(force, float).reshape(len(position), components),
-            twist=None if row["escape_twist"] is None else np.asarray(row["escape_twist"], float),
-            bound_twist=None if row.get("bound_twist") is None else np.asarray(row["bound_twist"], float),
-        )
+
+        def real(value: Any, *shape: int) -> Any:
+            return None if value is None else np.asarray(value, float).reshape(shape or np.shape(value))
+
+        try:
+            position = real(row["position"], -1, 3)
+            return cls(
+                position=position,
+                normal=real(row["normal"], -1, 3),
+                friction=real(row["friction"]),
+                torsion=real(row["torsion"]),
+                active=np.asarray(row["active"], bool),
+                centre_of_mass=com,
+                model=kind,
+                status=status,
+                margin=float("nan") if row["margin"] is None else float(row["margin"]),
+                upper=float("nan") if row["upper"] is None else float(row["upper"]),
+                rank=row["rank"],
+                force=real(row["internal_force"], len(position), components),
+                twist=real(row["escape_twist"]),
+                bound_twist=real(row.get("bound_twist")),
+            )
+        except UserError:
+            raise
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(f"the row is damaged ({error})") from error
 
 
 @dataclass(frozen=True)
@@ -123,6 +147,15 @@ class ForceAnswer(StoredGrasp):
     contact_force: np.ndarray | None
     escape_twist: np.ndarray | None
     load_twist: np.ndarray | None
+
+    def _shapes(self, k: int, d: int, n: int) -> dict[str, tuple[int, ...]]:
+        m = wrench_dimension(d)
+        twists = dict.fromkeys(("escape_twist", "load_twist", "wrench"), (m,))
+        return (
+            super()._shapes(k, d, n)
+            | twists
+            | {"force": (k, n), "contact_force": (k, d), "cost": (), "lower": ()}
+        )
 
     @classmethod
     def from_row(cls, row: dict[str, Any], metadata: dict[str, Any]) -> ForceAnswer:
@@ -147,6 +180,8 @@ class ForceAnswer(StoredGrasp):
                 **{name: row[name] for name in names},
                 **{name: metadata[name] for name in said},
             )
+        except UserError:
+            raise
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"the file of forces is damaged or incomplete ({error})") from error
 
