@@ -88,7 +88,7 @@ class ContactFile:
             raise UserError(f"{self.path}: the column active must be boolean")
         if "grasp_id" in self.columns:
             grasp_id = dense(batch.column("grasp_id"), "grasp_id")
-            if grasp_id.dtype.kind not in "iu":
+            if grasp_id.dtype.kind not in "iu" or grasp_id.ndim != 1:
                 raise UserError(f"{self.path}: the column grasp_id must hold whole numbers without nulls")
             grasp_id = grasp_id.astype(np.int64)
         else:

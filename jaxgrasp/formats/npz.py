@@ -67,7 +67,7 @@ def load_grasp(path: str | os.PathLike) -> Grasp:
         archive = open_archive(path, file, MOST_BYTES, len(NAMES))
         try:
             known = {name: _array(path, archive, name) for name in NAMES}
-            header = json.loads(known["header"][:HEADER_BYTES].tobytes().decode())
+            header = json.loads(known["header"].ravel()[:HEADER_BYTES].tobytes().decode())
             if (header["format"], header["version"]) != (FORMAT, VERSION):
                 raise ValueError(
                     f"it holds {str(header['format'])[:40]!r} version {str(header['version'])[:40]}"
@@ -89,7 +89,7 @@ def _array(path: Any, archive: ZipFile, name: str) -> np.ndarray:
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     try:
         shape, fortran, dtype = read(data, max_header_size=HEADER_BYTES)
-    except (MemoryError, RecursionError, SyntaxError) as error:
+    except Exception as error:  # NumPy reads it as a text of Python's
         raise ValueError(f"the header of {name} is damaged") from error
     left = data.getbuffer()[data.tell() :]
     if dtype.hasobject or len(shape) > 32 or dtype.itemsize * math.prod(shape) != len(left):

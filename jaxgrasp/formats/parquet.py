@@ -300,7 +300,7 @@ def read_row(path: Path, row: int) -> tuple[dict[str, Any], dict[str, Any]]:
         metadata = stored_metadata(path, file)
         former = metadata.get("schema_version") == 1
         names = [{"upper": "gap"}.get(name, name) if former else name for name in VERDICT_COLUMNS]
-        require(path, file, (*REQUIRED, "friction", "torsion", "active", *names))
+        require(path, file, (*REQUIRED, "friction", "torsion", "active", *names, "grasp_id"))
         values = {LATER: None} | as_row(row_of(path, file, row))
     if former:
         margin, gap = values["margin"], values.pop("gap")

@@ -12,6 +12,16 @@ from ..core import Status, UserError, wrench_dimension
 
 __all__ = ["ForceAnswer", "StoredGrasp", "Verdict"]
 
+MAY_LACK = (
+    "rank",
+    "force",
+    "twist",
+    "bound_twist",
+    "contact_force",
+    "escape_twist",
+    "load_twist",
+)  # None: there is none
+
 
 @dataclass(frozen=True)
 class StoredGrasp:
@@ -33,8 +43,11 @@ class StoredGrasp:
         d, k = len(self.centre_of_mass), len(self.position)
         for name, shape in self._shapes(k, d, len(self.components)).items():
             value = getattr(self, name)
-            if value is not None and np.shape(value) != shape:
-                raise UserError(f"the row is damaged: {name} has the shape {np.shape(value)}, not {shape}")
+            if value is None and name in MAY_LACK:
+                continue
+            there = getattr(value, "shape", ())  # of a number: ()
+            if value is None or there != shape:
+                raise UserError(f"the row is damaged: {name} has the shape {there}, not {shape}")
 
     def _shapes(self, k: int, d: int, n: int) -> dict[str, tuple[int, ...]]:
         shapes: dict[str, tuple[int, ...]] = {"position": (k, d), "normal": (k, d)}
@@ -85,7 +98,15 @@ class Verdict(StoredGrasp):
     bound_twist: np.ndarray | None = None
 
     def _shapes(self, k: int, d: int, n: int) -> dict[str, tuple[int, ...]]:
-        own = {"centre_of_mass": (3,), "force": (k, n), "twist": (6,), "bound_twist": (6,), "margin": (), "upper": (), "rank": ()}
+        own = {
+            "centre_of_mass": (3,),
+            "force": (k, n),
+            "twist": (6,),
+            "bound_twist": (6,),
+            "margin": (),
+            "upper": (),
+            "rank": (),
+        }
         return super()._shapes(k, 3, n) | own
 
     @classmethod
@@ -119,7 +140,7 @@ class Verdict(StoredGrasp):
                 status=status,
                 margin=float("nan") if row["margin"] is None else float(row["margin"]),
                 upper=float("nan") if row["upper"] is None else float(row["upper"]),
-                rank=row["rank"],
+                rank=None if row["rank"] is None else int(row["rank"]),
                 force=real(row["internal_force"], len(position), components),
                 twist=real(row["escape_twist"]),
                 bound_twist=real(row.get("bound_twist")),
@@ -165,7 +186,7 @@ class ForceAnswer(StoredGrasp):
             force = None if row["force"] is None else np.reshape(row["force"], (k, -1))
             com, kind = np.asarray(metadata["centre_of_mass"], float), metadata["model"]["kind"]
             component_names(kind, len(com))  # KeyError for a model that we do not know
-            names = ("row", "grasp_id", "contact_force", "escape_twist", "load_twist", "cost", "lower")
+            names = ("contact_force", "escape_twist", "load_twist")
             said = ("load", "criterion", "max_normal", "tolerance")
             return cls(
                 **{
@@ -177,7 +198,9 @@ class ForceAnswer(StoredGrasp):
                 model=kind,
                 status=Status(row["status"]),
                 force=force,
-                **{name: row[name] for name in names},
+                **{name: None if row[name] is None else np.asarray(row[name], float) for name in names},
+                **{name: int(row[name]) for name in ("row", "grasp_id")},
+                **{name: float(row[name]) for name in ("cost", "lower")},
                 **{name: metadata[name] for name in said},
             )
         except UserError:
