@@ -76,10 +76,13 @@ def explain(
 ) -> None:
     from ..backend import usable_backend
     from ..formats import read_metadata, read_row
+    from ..jobs import writable
     from ..report import Verdict, draw, reprove_verdict
     from ..report import explain as words
 
     usable_backend(say)
+    if picture is not None:
+        writable(picture, "--picture")
     if "load" in read_metadata(file):
         if picture is not None or object is not None:
             raise UserError(

@@ -41,6 +41,7 @@ from .products import matvec, rmatvec, vector_inner, vector_norm
 from .reduced_kkt import KKTVector, kkt_solve
 from .regularity import regular
 from .singular_values import row_svd
+from .small_matrices import eigenvalues, left_svd, null_basis, pseudo_inverse, singular_values, solve
 
 __all__ = [
     "Bounds",
@@ -67,13 +68,16 @@ __all__ = [
     "cone_min",
     "cone_sum",
     "determinant",
+    "eigenvalues",
     "entries",
     "inner",
     "interior_distance",
     "inverse_frobenius",
     "kkt_solve",
     "lagrangian",
+    "left_svd",
     "matvec",
+    "null_basis",
     "null_combination",
     "orthonormal_rows",
     "pair",
@@ -82,11 +86,14 @@ __all__ = [
     "pair_sum",
     "pair_where",
     "point_tangent",
+    "pseudo_inverse",
     "regular",
     "residual_lower",
     "residuals",
     "rmatvec",
     "row_svd",
+    "singular_values",
+    "solve",
     "solve_convex_cone_program",
     "solve_linear_cone_program",
     "solve_lower",

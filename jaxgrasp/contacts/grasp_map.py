@@ -5,6 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 
+from ..conic import null_basis, singular_values
 from ..core import Array, Float, Int, contact_frame, cross, normalize, rank_tolerance, wrench_dimension
 from .grasp import Grasp
 from .models import Component
@@ -95,9 +96,7 @@ def _per_length(grasp: Grasp, matrix: Array) -> Array:
 @eqx.filter_jit
 def grasp_singular_values(grasp: Grasp) -> Float[Array, "*batch m"]:
     """Singular values of the folded map with lengths divided by L, largest first; no unit."""
-    values = jnp.linalg.svd(_per_length(grasp, folded_grasp_map(grasp)), compute_uv=False)
-    missing = wrench_dimension(grasp.dimension) - values.shape[-1]
-    return jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)])
+    return singular_values(_per_length(grasp, folded_grasp_map(grasp)))
 
 
 @eqx.filter_jit
@@ -119,17 +118,7 @@ def null_space(grasp: Grasp) -> Float[Array, "*batch kn kn"]:
     G = _per_length(grasp, grasp_map(grasp))
     scale = jnp.where(grasp.active[..., None], grasp.model.scaling(grasp.dimension), 0.0)
     exists = (scale != 0).reshape(*scale.shape[:-2], -1)
-    # A component that does not exist gets a row of its own, so it drops out of the null space.
-    identity = jnp.eye(G.shape[-1], dtype=G.dtype)
-    system = jnp.concatenate(
-        [jnp.where(exists[..., None, :], G, 0.0), jnp.where(exists[..., None, :], 0.0, identity)], axis=-2
-    )
-    _, values, rows = jnp.linalg.svd(system, full_matrices=False)
-    largest = jnp.maximum(values[..., :1], 1.0)
-    independent = jnp.sum(values > rank_tolerance(grasp.dtype) * largest, axis=-1)
-    basis = jnp.swapaxes(rows[..., ::-1, :], -1, -2)  # null vectors first
-    kept = jnp.arange(G.shape[-1]) < G.shape[-1] - independent[..., None]
-    return jnp.where(kept[..., None, :], basis, 0.0)
+    return null_basis(jnp.where(exists[..., None, :], G, 0.0), exists, rank_tolerance(grasp.dtype))
 
 
 @eqx.filter_jit

@@ -16,7 +16,9 @@ from .arrays import (
     widened,
 )
 from .broadcast import spread
+from .claim import claimed
 from .errors import UserError
+from .files import check_file, open_archive, open_file, read_file, read_member
 from .geometry import (
     applied,
     contact_frame,
@@ -78,6 +80,8 @@ __all__ = [
     "as_array",
     "balance_tolerance",
     "bracket_width",
+    "check_file",
+    "claimed",
     "complementary_ratio",
     "contact_frame",
     "cross",
@@ -94,6 +98,8 @@ __all__ = [
     "load_limit",
     "normalize",
     "normalize_components",
+    "open_archive",
+    "open_file",
     "orientation_matrix",
     "part_of",
     "perturbation_tolerance",
@@ -101,6 +107,8 @@ __all__ = [
     "placed",
     "proven_limit",
     "rank_tolerance",
+    "read_file",
+    "read_member",
     "real_array",
     "require_precision",
     "renamed",

@@ -12,6 +12,8 @@ from jax.core import Tracer
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
+from .forks import check_process
+
 __all__ = [
     "Array",
     "ArrayLike",
@@ -69,6 +71,7 @@ def as_array(value: ArrayLike) -> Array:
 
 def placed(array: np.ndarray) -> Array:
     """``array``, which nobody changes any more, as JAX's: ``jnp.asarray`` would compile a program for each shape."""
+    check_process()
     return jax.device_put(array)
 
 

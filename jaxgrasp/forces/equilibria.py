@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jax.typing import ArrayLike
 
+from ..conic import pseudo_inverse
 from ..contacts import Grasp, TorqueLimits, folded_grasp_map, length_scale
 from ..core import Answer, Array, Bool, Float, Int, Status, first_of, rank_tolerance
 from ..resistance import wrench_resistance
@@ -159,7 +160,7 @@ def squeeze(grasp: Grasp, wrench: Float[ArrayLike, "*batch m"]) -> Squeeze:
     A = jnp.expand_dims(per_length[..., None] * folded_grasp_map(grasp), axes)
     scaled_load = loads * jnp.expand_dims(per_length, axes)
     cut = rank_tolerance(grasp.dtype)
-    least = -jnp.einsum("...ij,...j->...i", jnp.linalg.pinv(A, rtol=cut), scaled_load)
+    least = -jnp.einsum("...ij,...j->...i", pseudo_inverse(A, cut), scaled_load)
     missing = jnp.einsum("...ij,...j->...i", A, least) + scaled_load
     balanced = jnp.sqrt(jnp.sum(missing * missing, -1)) <= 1e-9 * jnp.sqrt(jnp.sum(scaled_load**2, -1))
 

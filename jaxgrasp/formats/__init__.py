@@ -3,13 +3,14 @@
 from .check_table import check_schema, check_table, read_check_columns
 from .contact_file import ContactFile, GraspFile
 from .force_table import Forces, force_schema, force_table, read_force_row
+from .metadata import METADATA_KEY, dump_metadata
 from .npz import SavedGrasps, load_grasp, save_grasp
 from .parquet import (
-    METADATA_KEY,
+    MOST_BYTES,
     Contacts,
     Verdicts,
     as_row,
-    dump_metadata,
+    damage_told,
     read_metadata,
     read_row,
     verdict_schema,
@@ -19,6 +20,7 @@ from .parquet import (
 
 __all__ = [
     "METADATA_KEY",
+    "MOST_BYTES",
     "ContactFile",
     "Contacts",
     "Forces",
@@ -28,6 +30,7 @@ __all__ = [
     "as_row",
     "check_schema",
     "check_table",
+    "damage_told",
     "dump_metadata",
     "force_schema",
     "force_table",

@@ -25,7 +25,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from .lists import fixed_lists
-from .parquet import METADATA_KEY, dump_metadata
+from .metadata import METADATA_KEY, dump_metadata
 
 __all__ = ["check_schema", "check_table", "read_check_columns"]
 

@@ -13,7 +13,8 @@ import pyarrow.compute as pc
 
 from ..core import Status, UserError
 from .lists import dense
-from .parquet import REQUIRED, Contacts, open_parquet, require, row_of, stored_metadata
+from .metadata import stored_metadata
+from .parquet import MOST_CONTACTS, REQUIRED, Contacts, batches, open_parquet, require, row_of
 
 __all__ = ["ContactFile", "GraspFile"]
 
@@ -37,18 +38,21 @@ class ContactFile:
             self.rows = file.metadata.num_rows
             if self.rows < 1:
                 raise UserError(f"{self.path} holds no rows")
-            first = next(file.iter_batches(1, columns=list(REQUIRED)))
+            first = next(batches(self.path, file, 1, list(REQUIRED)), None)
+            if first is None:
+                raise UserError(f"{self.path} is damaged: it has fewer rows than it says")
         self.fingers = self._vectors(first, "position").shape[1]
         if self.fingers < 1:
             raise UserError(f"{self.path}: the column position holds no contacts in its first row")
+        if self.fingers > MOST_CONTACTS:
+            raise UserError(
+                f"{self.path} has {self.fingers} contacts a grasp; at most {MOST_CONTACTS} are read"
+            )
 
     @property
     def kind(self) -> str:
         """The contact model's name, one of ``contacts.MODELS`` unless the file is newer than we are; "" if not said."""
-        model = self.metadata.get("model") or {}
-        if not isinstance(model, dict):
-            raise UserError(f"{self.path}: the metadata under the key 'jaxgrasp' is damaged")
-        return model.get("kind") or ""
+        return (self.metadata.get("model") or {}).get("kind") or ""
 
     def _vectors(self, batch: pa.RecordBatch, name: str) -> np.ndarray:
         values = dense(batch.column(name), name)
@@ -64,7 +68,7 @@ class ContactFile:
         """The rows in order, ``size`` at a time."""
         start = 0
         with open_parquet(self.path) as file:
-            for batch in file.iter_batches(size, columns=self.columns):
+            for batch in batches(self.path, file, size, self.columns):
                 yield self._contacts(batch, start)
                 start += len(batch)
 
@@ -84,7 +88,7 @@ class ContactFile:
             raise UserError(f"{self.path}: the column active must be boolean")
         if "grasp_id" in self.columns:
             grasp_id = dense(batch.column("grasp_id"), "grasp_id")
-            if grasp_id.dtype.kind not in "iu":
+            if grasp_id.dtype.kind not in "iu" or grasp_id.ndim != 1:
                 raise UserError(f"{self.path}: the column grasp_id must hold whole numbers without nulls")
             grasp_id = grasp_id.astype(np.int64)
         else:
@@ -129,8 +133,8 @@ class GraspFile(ContactFile):
         if status is None:
             return self.rows
         with open_parquet(self.path) as file:
-            batches = file.iter_batches(1 << 20, columns=["status"])
-            return sum(int(np.count_nonzero(_equal(batch, status))) for batch in batches)
+            found = batches(self.path, file, 1 << 20, ["status"])
+            return sum(int(np.count_nonzero(_equal(batch, status))) for batch in found)
 
     def selected(self, size: int, status: Status | None = None) -> Iterator[tuple[np.ndarray, Contacts]]:
         """Row numbers and contacts of the rows with this status, ``size`` at a time, in order."""
@@ -148,7 +152,7 @@ class GraspFile(ContactFile):
     def _kept(self, size: int, status: Status | None) -> Iterator[tuple[np.ndarray, Contacts]]:
         start = 0
         with open_parquet(self.path) as file:
-            for batch in file.iter_batches(size, columns=[*self.columns, "status"]):
+            for batch in batches(self.path, file, size, [*self.columns, "status"]):
                 rows = np.arange(start, start + len(batch))
                 kept = np.ones(len(batch), bool) if status is None else _equal(batch, status)
                 yield rows[kept], self._contacts(batch, start).taken(kept)
@@ -158,7 +162,7 @@ class GraspFile(ContactFile):
         """The contacts of row ``number``, from 0."""
         with open_parquet(self.path) as file:
             found = row_of(self.path, file, number, self.columns)
-        return self._contacts(found.to_batches()[0], number)
+            return self._contacts(found.to_batches()[0], number)
 
 
 def _equal(batch: pa.RecordBatch, status: Status) -> np.ndarray:

@@ -39,16 +39,8 @@ import pyarrow as pa
 
 from ..core import Status, UserError
 from .lists import fixed_lists, nullable_lists
-from .parquet import (
-    METADATA_KEY,
-    Contacts,
-    as_row,
-    dump_metadata,
-    open_parquet,
-    require,
-    row_of,
-    stored_metadata,
-)
+from .metadata import METADATA_KEY, dump_metadata, stored_metadata
+from .parquet import Contacts, as_row, open_parquet, require, row_of
 
 if TYPE_CHECKING:
     from ..forces import OptimalForces

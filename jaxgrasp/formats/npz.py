@@ -6,22 +6,27 @@ grasp holds them, and ``header``: JSON in bytes with ``format``, ``version`` and
 
 from __future__ import annotations
 
+import io
 import json
+import math
 import os
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from zipfile import BadZipFile
+from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 
 from ..contacts import MODELS, Grasp, contact_model, model_name
-from ..core import Status, UserError
-from .parquet import Contacts
+from ..core import Status, UserError, claimed, open_archive, open_file, read_member
+from .parquet import MOST_CONTACTS, Contacts
 
 __all__ = ["SavedGrasps", "load_grasp", "save_grasp"]
 
 FORMAT, VERSION = "jaxgrasp lane", 1
+NAMES = ("header", "position", "normal", "friction", "torsion", "active")
+MOST_BYTES = 256 << 20  # of all arrays together
+HEADER_BYTES = 4096
 CLASSES = {kind.__name__: name for name, kind in MODELS.items()}
 
 
@@ -36,45 +41,60 @@ def save_grasp(grasp: Grasp, path: str | os.PathLike) -> None:
     if model not in CLASSES:
         raise ValueError(f"cannot save the contact model {model}; known models: {', '.join(sorted(CLASSES))}")
     header = {"format": FORMAT, "version": VERSION, "model": model}
-    beside = path.with_name(path.name + ".tmp")
-    try:
-        with open(beside, "wb") as file:
-            np.savez(
-                file,
-                header=np.frombuffer(json.dumps(header).encode(), np.uint8),
-                position=np.asarray(grasp.position),
-                normal=np.asarray(grasp.normal),
-                friction=np.asarray(grasp.model.friction_coefficient),
-                torsion=np.asarray(grasp.model.torsion_coefficient),
-                active=np.asarray(grasp.active),
-            )
-        os.replace(beside, path)
-    except BaseException:
-        beside.unlink(missing_ok=True)
-        raise
+    arrays = {
+        "header": np.frombuffer(json.dumps(header).encode(), np.uint8),
+        "position": np.asarray(grasp.position),
+        "normal": np.asarray(grasp.normal),
+        "friction": np.asarray(grasp.model.friction_coefficient),
+        "torsion": np.asarray(grasp.model.torsion_coefficient),
+        "active": np.asarray(grasp.active),
+    }
+    if sum(x.nbytes for x in arrays.values()) > MOST_BYTES or grasp.contacts > MOST_CONTACTS:
+        raise ValueError("such a file holds one grasp, or a few: index the batch, such as grasps[:1000]")
+    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with claimed(path):
+        try:
+            with open(beside, "wb") as file:
+                np.savez(file, **arrays)
+            os.replace(beside, path)
+        finally:
+            beside.unlink(missing_ok=True)
 
 
 def load_grasp(path: str | os.PathLike) -> Grasp:
-    """The grasp that ``save_grasp`` wrote; ValueError if the file is not one."""
+    """The grasp that ``save_grasp`` wrote; ValueError if the file is not one, or holds more than 256 MiB of numbers."""
+    with open_file(path, MOST_BYTES + (1 << 20)) as file:
+        archive = open_archive(path, file, MOST_BYTES, len(NAMES))
+        try:
+            known = {name: _array(path, archive, name) for name in NAMES}
+            header = json.loads(known["header"].ravel()[:HEADER_BYTES].tobytes().decode())
+            if (header["format"], header["version"]) != (FORMAT, VERSION):
+                raise ValueError(
+                    f"it holds {str(header['format'])[:40]!r} version {str(header['version'])[:40]}"
+                )
+            model = contact_model(CLASSES[header["model"]], known["friction"], known["torsion"])
+            grasp = Grasp(known["position"], known["normal"], model, known["active"])
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+            reason = (str(error).splitlines() or [""])[0][:200]
+            raise ValueError(f"{path} is not a grasp written by jaxgrasp.save_grasp ({reason})") from error
+    if grasp.contacts > MOST_CONTACTS:
+        raise ValueError(f"{path} has {grasp.contacts} contacts a grasp; at most {MOST_CONTACTS} are read")
+    return grasp
+
+
+def _array(path: Any, archive: ZipFile, name: str) -> np.ndarray:
+    """The array of a member; its own header is not believed about how much there is."""
+    data = io.BytesIO(read_member(path, archive, f"{name}.npy"))
+    version = np.lib.format.read_magic(data)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     try:
-        with open(path, "rb") as source, np.load(source, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        header = json.loads(arrays["header"].tobytes().decode())
-        if (header["format"], header["version"]) != (FORMAT, VERSION):
-            raise ValueError(f"it holds {header['format']!r} version {header['version']}")
-        model = contact_model(CLASSES[header["model"]], arrays["friction"], arrays["torsion"])
-        return Grasp(arrays["position"], arrays["normal"], model, arrays["active"])
-    except (
-        OSError,
-        KeyError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        EOFError,
-        BadZipFile,
-        zlib.error,
-    ) as error:
-        raise ValueError(f"{path} is not a grasp written by jaxgrasp.save_grasp ({error})") from error
+        shape, fortran, dtype = read(data, max_header_size=HEADER_BYTES)
+    except Exception as error:  # NumPy reads it as a text of Python's
+        raise ValueError(f"the header of {name} is damaged") from error
+    left = data.getbuffer()[data.tell() :]
+    if dtype.hasobject or len(shape) > 32 or dtype.itemsize * math.prod(shape) != len(left):
+        raise ValueError(f"{name} does not hold what its header says")
+    return np.frombuffer(left, dtype).reshape(shape, order="F" if fortran else "C")
 
 
 class SavedGrasps:

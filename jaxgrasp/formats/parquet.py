@@ -25,25 +25,20 @@ the dtype of the run; ``real[k][3]`` is fixed_size_list<fixed_size_list<real>[3]
 (Forces and twists are lists of variable size: few readers take nulls among fixed-size ones. More columns may
 follow, which readers of grasps pass over: ``jaxgrasp place`` writes two, see ``jobs.place``.)
 
-The file's metadata holds one key, ``jaxgrasp``, with JSON: ``schema_version``; ``object`` (name, sha256);
-``unit``; ``centre_of_mass`` (m, mesh frame); ``model`` (kind, friction, torsion); ``fingers``; ``dtype``;
-``seed``; ``command``; ``versions``; and what else the run wants to be known by. No time, no path but the
-one typed: the same run gives the same bytes.
+The file's metadata holds one key, ``jaxgrasp``, with JSON (``formats.metadata``): ``schema_version``;
+``object`` (name, sha256); ``unit``; ``centre_of_mass`` (m, mesh frame); ``model`` (kind, friction, torsion);
+``fingers``; ``dtype``; ``seed``; ``command``; ``versions``; and what else the run wants to be known by. No time, no
+path but the one typed: the same run gives the same bytes.
 
 A file of contacts needs ``position`` and ``normal`` only; lists of variable size and flat lists of 3 k
 numbers will do (``formats.contact_file`` reads them).
-
-Schema versions (of all files of ours, that of forces in ``formats.force_table`` included; all of them are read):
-
-    2               ``upper`` instead of ``gap``; in files of forces ``lower`` instead of ``bound``
-    1               ``gap``, the width of the bracket: upper = margin + gap; ``bound`` of the cost, now ``lower``
 """
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,33 +47,45 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ..core import UserError
+from ..core import UserError, check_file
 from .lists import fixed_lists, nullable_lists
+from .metadata import METADATA_KEY, dump_metadata, stored_metadata
 
 if TYPE_CHECKING:
     from ..resistance import WrenchResistance
 
 __all__ = [
-    "METADATA_KEY",
-    "SCHEMA_VERSION",
     "Contacts",
     "Verdicts",
     "as_row",
-    "dump_metadata",
+    "batches",
+    "damage_told",
     "open_parquet",
     "read_metadata",
     "read_row",
     "require",
     "row_of",
     "verdict_schema",
-    "stored_metadata",
     "verdict_table",
     "write",
 ]
 
-SCHEMA_VERSION, READABLE = 2, (1, 2)
-METADATA_KEY = b"jaxgrasp"
 REQUIRED = ("position", "normal")
+MOST_BYTES = 1 << 40  # rows are read as they are needed, so memory does not follow the size
+MOST_CONTACTS = 1024  # of a grasp
+LONGEST = 4 * MOST_CONTACTS  # numbers of a row
+BATCH = 4096  # rows read at a time where one is wanted
+# pyarrow's own, and what NumPy and the standard library make of numbers and text that cannot be.
+DAMAGED = (
+    pa.ArrowException,
+    OSError,
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    OverflowError,
+    MemoryError,
+)
 # Columns with few distinct values; dictionaries on the others would cost time for nothing.
 REPETITIVE = ["normal.list.element.list.element", "friction.list.element", "torsion.list.element"]
 REPETITIVE += ["status", "rank", "iterations"]
@@ -166,11 +173,6 @@ def verdict_schema(fingers: int, dtype: str, metadata: dict[str, Any] | None = N
     return pa.schema(columns, {METADATA_KEY: dump_metadata(metadata)} if metadata is not None else None)
 
 
-def dump_metadata(metadata: dict[str, Any]) -> bytes:
-    """JSON with sorted keys: equal metadata are equal bytes."""
-    return json.dumps({"schema_version": SCHEMA_VERSION, **metadata}, sort_keys=True).encode()
-
-
 def verdict_table(contacts: Contacts, verdicts: Verdicts, kind: pa.Schema) -> pa.Table:
     """One Arrow table of these rows with the columns of ``kind``, nulls where the documentation says so."""
     invalid = np.isnan(verdicts.margin)
@@ -209,15 +211,26 @@ def write(path: Path, rows: Iterable[pa.Table], kind: pa.Schema, folder: Path | 
         beside.unlink(missing_ok=True)
 
 
-def open_parquet(path: Path) -> pq.ParquetFile:
-    """The file, open; UserError where there is none or it is no Parquet."""
-    if not path.exists():
-        raise UserError(f"{path}: no such file")
+@contextmanager
+def open_parquet(path: Path) -> Generator[pq.ParquetFile]:
+    """The file, open; UserError where there is none, where it is no Parquet, and where its bytes turn out damaged."""
+    check_file(path, MOST_BYTES)
+    with damage_told(f"{path} cannot be read as Parquet"):
+        file = pq.ParquetFile(path)
+    with file, damage_told(f"{path} is damaged"):
+        yield file
+
+
+@contextmanager
+def damage_told(what: str) -> Generator[None]:
+    """What a reader of foreign bytes may raise, as a UserError: ``what``, and the reason in one line."""
     try:
-        return pq.ParquetFile(path)
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise UserError(f"{path} cannot be read as Parquet: {reason}") from error
+        yield
+    except UserError:
+        raise
+    except DAMAGED as error:
+        reason = (str(error).splitlines() or [""])[0][:200] or type(error).__name__
+        raise UserError(f"{what}: {reason}") from error
 
 
 def require(path: Path, file: pq.ParquetFile, names: Sequence[str]) -> None:
@@ -228,22 +241,6 @@ def require(path: Path, file: pq.ParquetFile, names: Sequence[str]) -> None:
             f"{path} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}; it has: "
             f"{', '.join(file.schema_arrow.names)}"
         )
-
-
-def stored_metadata(path: Path, file: pq.ParquetFile) -> dict[str, Any]:
-    """The metadata under our key; empty where there are none, UserError where they are damaged or too new."""
-    raw = (file.schema_arrow.metadata or {}).get(METADATA_KEY)
-    if raw is None:
-        return {}
-    try:
-        found = json.loads(raw)
-        version = found["schema_version"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path}: the metadata under the key 'jaxgrasp' is damaged") from error
-    if version not in READABLE:
-        known = " and ".join(map(str, READABLE))
-        raise UserError(f"{path} has schema version {version}, this jaxgrasp reads {known}; update jaxgrasp")
-    return found
 
 
 def read_metadata(path: Path) -> dict[str, Any]:
@@ -261,7 +258,31 @@ def row_of(path: Path, file: pq.ParquetFile, number: int, columns: Sequence[str]
     while number >= file.metadata.row_group(group).num_rows:
         number -= file.metadata.row_group(group).num_rows
         group += 1
-    return file.read_row_group(group, columns=columns).slice(number, 1).combine_chunks()
+    for batch in batches(path, file, BATCH, columns, [group]):
+        if number < len(batch):
+            return pa.Table.from_batches([batch.slice(number, 1)]).combine_chunks()
+        number -= len(batch)
+    raise UserError(f"{path} is damaged: it has fewer rows than it says")
+
+
+def batches(
+    path: Path,
+    file: pq.ParquetFile,
+    size: int,
+    columns: Sequence[str] | None = None,
+    groups: Sequence[int] | None = None,
+) -> Iterator[pa.RecordBatch]:
+    """Rows in order, ``size`` at a time. UserError, before any is read, where rows are longer than a grasp's."""
+    for number in range(file.num_row_groups) if groups is None else groups:
+        group = file.metadata.row_group(number)
+        for column in map(group.column, range(group.num_columns)):
+            name, most = column.path_in_schema.split(".")[0], LONGEST * max(1, group.num_rows)
+            if (columns is None or name in columns) and column.num_values > most:
+                raise UserError(
+                    f"{path}: the column {name} has {column.num_values // max(1, group.num_rows)} numbers a row; "
+                    f"grasps of up to {MOST_CONTACTS} contacts are read"
+                )
+    return file.iter_batches(size, columns=columns, row_groups=groups)
 
 
 def as_row(found: pa.Table) -> dict[str, Any]:
@@ -279,7 +300,7 @@ def read_row(path: Path, row: int) -> tuple[dict[str, Any], dict[str, Any]]:
         metadata = stored_metadata(path, file)
         former = metadata.get("schema_version") == 1
         names = [{"upper": "gap"}.get(name, name) if former else name for name in VERDICT_COLUMNS]
-        require(path, file, (*REQUIRED, "friction", "torsion", "active", *names))
+        require(path, file, (*REQUIRED, "friction", "torsion", "active", *names, "grasp_id"))
         values = {LATER: None} | as_row(row_of(path, file, row))
     if former:
         margin, gap = values["margin"], values.pop("gap")

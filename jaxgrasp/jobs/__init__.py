@@ -4,6 +4,7 @@ from .check import check, controllability_of
 from .check_request import CheckPlan, CheckRequest, plan_check
 from .forces import forces_of_file, forces_of_row
 from .forces_request import ForcesPlan, ForcesRequest, plan_forces
+from .outputs import writable
 from .place import Placed, draw_best, place
 from .place_request import PlacePlan, PlaceRequest, plan_place
 from .screen import screen
@@ -33,4 +34,5 @@ __all__ = [
     "plan_place",
     "plan_screen",
     "screen",
+    "writable",
 ]

@@ -21,7 +21,7 @@ import pyarrow as pa
 from ..backend import precision
 from ..certificates import check
 from ..contacts import Component, Grasp, contact_model
-from ..core import Status, UserError, contact_frame, normalize
+from ..core import Status, UserError, claimed, contact_frame, normalize
 from ..forces import OptimalForces, closeness, optimize_forces
 from ..formats import Contacts, Forces, as_row, force_schema, force_table, write
 from .forces_request import ForcesPlan
@@ -142,7 +142,8 @@ def forces_of_file(plan: ForcesPlan, progress: Callable[[ForceSummary], None] | 
 def _write(plan: ForcesPlan, rows: Iterable[pa.Table], kind: pa.Schema) -> None:
     assert plan.output is not None
     try:
-        write(plan.output, rows, kind)
+        with claimed(plan.output):
+            write(plan.output, rows, kind)
     except OSError as error:
         raise UserError(f"cannot write {plan.output}: {error.strerror or error}") from error
 

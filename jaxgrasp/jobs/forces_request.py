@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from ..contacts import MODELS, component_names
-from ..core import Status, UserError
+from ..core import Status, UserError, open_file
 from ..forces import CRITERIA, Criterion, make_criterion, positive_option
-from ..formats import Contacts, GraspFile, SavedGrasps
+from ..formats import MOST_BYTES, Contacts, GraspFile, SavedGrasps
 from .outputs import derived_output, not_the_source, writable
 from .provenance import digest, provenance
 from .threads import thread_count
@@ -154,14 +154,10 @@ def _status(name: str | None) -> Status | None:
 
 def _source(name: str) -> GraspFile | SavedGrasps:
     path = Path(name)
-    if not path.is_file():
-        hint = f"{name} is no file of grasps: jaxgrasp screen OBJECT writes one"
-        raise UserError(hint if not path.suffix or path.exists() else f"{path}: no such file")
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(4)
-    except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror or error}") from error
+    if not path.suffix and not path.exists():
+        raise UserError(f"{name} is no file of grasps: jaxgrasp screen OBJECT writes one")
+    with open_file(path, MOST_BYTES) as stream:
+        start = stream.read(4)
     if start == b"PK\x03\x04":
         return SavedGrasps(path)
     if start != b"PAR1":

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
-from ..core import UserError
+from ..core import UserError, claimed
 from ..objects import OBJECTS
 
 __all__ = ["default_output", "derived_output", "not_the_source", "writable"]
@@ -29,14 +28,6 @@ def not_the_source(output: Path, source: str) -> None:
 
 
 def writable(output: Path, option: str = "-o") -> None:
-    """Whether a file can be put there: UserError naming the ``option`` that says another place."""
-    if output.is_dir():
-        raise UserError(f"{output} is a directory; name a file with {option}")
-    beside = output.with_name(f".{output.name}.{os.getpid()}.try")
-    try:
-        beside.touch()
-        beside.unlink()
-    except OSError as error:
-        raise UserError(
-            f"{output} cannot be written: {error.strerror or error}; name another file with {option}"
-        ) from error
+    """Whether a file can be put there now: UserError naming the ``option`` that says another place."""
+    with claimed(output, option):
+        pass

@@ -20,7 +20,7 @@ import pyarrow as pa
 
 from ..backend import precision
 from ..contacts import contact_model
-from ..core import Status, UserError
+from ..core import Status, UserError, claimed
 from ..formats import Contacts, Verdicts, read_row, verdict_schema, verdict_table, write
 from ..placement import FLOOR, Placement, PlacementProgress, Search, place_contacts
 from ..report import Verdict, draw
@@ -72,7 +72,7 @@ def place(plan: PlacePlan, progress: Callable[[str, int, str], None] | None = No
         tell(doing, so_far.done, f"best {so_far.best:.4g}" if np.isfinite(so_far.best) else "")
 
     tell("measuring the object", 0, "")
-    with precision("float64"):
+    with claimed(plan.output), precision("float64"):
         surface = MeshSurface.from_body(plan.body, resolution=request.resolution)
         tell("screening", 0, "compiling")
         found = place_contacts(

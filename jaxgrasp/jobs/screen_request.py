@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..contacts import MODELS
-from ..core import UserError
-from ..formats import ContactFile, Contacts
+from ..core import UserError, open_file
+from ..formats import MOST_BYTES, ContactFile, Contacts
 from ..objects import BLOCK, METRES_PER, OBJECTS, AntipodalSampler, SurfaceSampler, load_mesh
 from .outputs import default_output
 from .provenance import digest, provenance
@@ -205,10 +205,10 @@ def _is_parquet(source: str) -> bool:
     if path.suffix.lower() in (".parquet", ".pq"):
         return True
     try:
-        with path.open("rb") as stream:
+        with open_file(path, MOST_BYTES) as stream:
             return stream.read(4) == b"PAR1"
-    except OSError:
-        return False
+    except (OSError, UserError):
+        return False  # whoever reads it as a mesh says why
 
 
 def _from_mesh(request: ScreenRequest) -> tuple[ContactChoice, Candidates]:

@@ -19,11 +19,12 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ..core import UserError
+from ..core import UserError, claimed, read_file
 from ..formats import METADATA_KEY, dump_metadata, write
 
 __all__ = ["Shards"]
 
+MOST_BYTES = 1 << 24  # of run.json
 SHARD_KEY = b"jaxgrasp.shard"
 
 
@@ -48,19 +49,18 @@ class Shards:
 
         UserError where not, or where the disk fails inside. However it ends, finished shards stay for ``resume``.
         """
-        self._claim(resume)
-        try:
-            yield
-        except OSError as error:
-            raise UserError(f"cannot write to {self.folder}: {error.strerror or error}") from error
-        finally:
-            if self.folder.exists() and not any(self.folder.glob("[0-9]*.arrow")):
-                shutil.rmtree(self.folder, ignore_errors=True)  # nothing worth resuming
+        with claimed(self.output):
+            self._claim(resume)
+            try:
+                yield
+            except OSError as error:
+                raise UserError(f"cannot write to {self.folder}: {error.strerror or error}") from error
+            finally:
+                if self.folder.exists() and not any(self.folder.glob("[0-9]*.arrow")):
+                    shutil.rmtree(self.folder, ignore_errors=True)  # nothing worth resuming
 
     def _claim(self, resume: bool) -> None:
-        output, parts = self.output, self.folder
-        if output.is_dir():
-            raise UserError(f"{output} is a directory; name a file with -o")
+        parts = self.folder
         identity = parts / "run.json"
         if parts.exists() and not parts.is_dir():
             raise UserError(f"{parts} is in the way: the shards go there; move it")
@@ -69,7 +69,7 @@ class Shards:
                 raise UserError(
                     f"{parts} holds an unfinished run: go on with --resume, or delete that directory"
                 )
-            there = identity.read_bytes()
+            there = read_file(identity, MOST_BYTES)
             if there != self.fingerprint:
                 raise UserError(f"{parts} belongs to another run: {_difference(there, self.fingerprint)}")
         try:
@@ -79,11 +79,9 @@ class Shards:
             beside = parts / f".run.{os.getpid()}.tmp"
             beside.write_bytes(self.fingerprint)
             os.replace(beside, identity)
-            if output.exists() and not os.access(output, os.W_OK):
-                raise PermissionError(13, "Permission denied")
         except OSError as error:
             raise UserError(
-                f"{output} cannot be written: {error.strerror or error}; name another file with -o"
+                f"{self.output} cannot be written: {error.strerror or error}; name another file with -o"
             ) from error
 
     def write(self, number: int, rows: pa.Table, about: dict[str, Any]) -> None:
@@ -114,7 +112,7 @@ class Shards:
 
     def finished(self, *extra: str) -> dict[str, Any] | None:
         """The metadata of the output if this very run has already written it (keys ``extra`` apart), else None."""
-        if self.folder.exists():
+        if self.folder.exists() or not self.output.is_file():
             return None
         try:
             metadata = json.loads((pq.read_schema(self.output).metadata or {})[METADATA_KEY])

@@ -38,6 +38,7 @@ def _coordinates(problem: LMIProblem, term: LogDetTerm, root: Array) -> _Coordin
     stacked = jnp.concatenate(
         [problem.matrices.reshape(N, -1), term.matrices.reshape(N, -1), root.T], axis=1
     ).T
+    stacked = after(stacked, problem.start)  # which may come from another problem
     length = jnp.linalg.norm(stacked, axis=0)
     length = jnp.where(length > 0, length, 1.0)
     _, values, rows = jnp.linalg.svd(stacked / length, full_matrices=False)
@@ -76,6 +77,11 @@ class _NewtonStep(eqx.Module):
     length: Array
 
 
+def after(x: Array, done: Array) -> Array:
+    """x, not before ``done`` is there: two LAPACK calls at once can wait for each other's workers for ever."""
+    return x + 0 * done.reshape(-1)[0]
+
+
 def _whitened(factor: Array, matrices: Array) -> tuple[Array, Array]:
     """``L^-1`` and ``W_i = L^-1 Q_i L^-T``."""
     inverse = jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(factor), dtype=factor.dtype), lower=True)
@@ -100,7 +106,7 @@ def _newton_step(
     t, (N, q, _) = iterate.weight, space.matrices.shape
     strength = t * term.weight
     inverse, W = _whitened(iterate.factor, space.matrices)
-    _, U = _whitened(iterate.term_factor, space.term_matrices)
+    _, U = _whitened(after(iterate.term_factor, inverse), space.term_matrices)
     y = space.inverse @ iterate.x
     slope = space.T.T @ problem.cost + space.root.T @ (space.root @ y)
     gradient = t * slope - jnp.trace(W, axis1=1, axis2=2) - strength * jnp.trace(U, axis1=1, axis2=2)
@@ -117,7 +123,7 @@ def _newton_step(
 
     D = jnp.einsum("i,iab->ab", direction, W)
     d = jnp.linalg.eigvalsh(D)
-    e = jnp.linalg.eigvalsh(jnp.einsum("i,iab->ab", direction, U))
+    e = jnp.linalg.eigvalsh(after(jnp.einsum("i,iab->ab", direction, U), d))
     proves = (jnp.max(d) <= 1) & (jnp.max(e) < 1) & exact
     bend = jnp.sum((space.root @ direction) ** 2)
     loss = jnp.sum(jnp.log1p(-jnp.where(proves, e, 0.0)) + e * e)
@@ -183,7 +189,7 @@ def _square_root(H: Array) -> Array:
 
 def minimize(problem: LMIProblem, goal: Array, max_steps: int = MAX_STEPS) -> LMISolution:
     """One problem, no batch axes. Under ``jax.vmap`` the problems run one after another: each takes its own number of
-    steps, and independent batched LAPACK calls can block each other for ever on a machine of few cores."""
+    steps, and no LAPACK call is one of a batch."""
     one = jax.custom_batching.sequential_vmap(lambda problem, goal: _minimize(problem, goal, max_steps))
     return one(problem, goal)
 
@@ -191,7 +197,8 @@ def minimize(problem: LMIProblem, goal: Array, max_steps: int = MAX_STEPS) -> LM
 def _minimize(problem: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
     """Follow the central path: a Newton step on phi_t; the bound it proves, if any; where x was central, raise t."""
     dtype, N = problem.cost.dtype, problem.cost.shape[-1]
-    root = jnp.zeros((1, N), dtype) if problem.curvature is None else _square_root(problem.curvature)
+    H = problem.curvature
+    root = jnp.zeros((1, N), dtype) if H is None else _square_root(after(H, problem.start))
     term = problem.log_det
     if term is None:  # B = 1: no cost
         term = LogDetTerm(jnp.zeros((), dtype), jnp.ones((1, 1), dtype), jnp.zeros((N, 1, 1), dtype))
@@ -222,7 +229,7 @@ def _minimize(problem: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
             stalled=~usable,
         )
 
-    factor, term_factor, value = _evaluated(problem, term, root, problem.start)
+    factor, term_factor, value = _evaluated(problem, term, root, after(problem.start, space.T))
     interior = _finite(factor, term_factor, value)  # else: not strictly feasible, or not numbers
     start = _Iterate(
         x=problem.start,
@@ -244,7 +251,8 @@ def _minimize(problem: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
 
 def _evaluated(problem: LMIProblem, term: LogDetTerm, root: Array, x: Array) -> tuple[Array, Array, Array]:
     """The Cholesky factors of Q(x) and B(x), not finite outside the domain, and the cost at x."""
-    factor, term_factor = jnp.linalg.cholesky(problem.Q(x)), jnp.linalg.cholesky(term.B(x))
+    factor = jnp.linalg.cholesky(problem.Q(x))
+    term_factor = jnp.linalg.cholesky(after(term.B(x), factor))
     quadratic = problem.cost @ x + jnp.sum((root @ x) ** 2) / 2
     log_det = jnp.sum(jnp.log(jnp.diagonal(term_factor)))
     return factor, term_factor, quadratic - 2 * term.weight * log_det

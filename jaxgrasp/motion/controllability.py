@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from ..conic import left_svd, singular_values
 from ..contacts import Grasp
 from ..core import Answer, Array, Float, Int, Status, first_of, rank_tolerance, wrench_dimension
 from ..resistance import wrench_resistance
@@ -122,12 +123,8 @@ def gramian(
     return (total + jnp.swapaxes(total, -1, -2)) / 2
 
 
-def _rank(matrix: Array, tolerance: float) -> tuple[Array, Array]:
-    """Rank and singular values; as many as rows."""
-    values = jnp.linalg.svd(matrix, compute_uv=False)
-    missing = matrix.shape[-2] - values.shape[-1]
-    values = jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, max(missing, 0))])
-    return jnp.sum(values > tolerance * values[..., :1], axis=-1).astype(jnp.int32), values
+def _rank(values: Array) -> Array:
+    return jnp.sum(values > rank_tolerance(values.dtype) * values[..., :1], axis=-1).astype(jnp.int32)
 
 
 def controllability(
@@ -159,18 +156,18 @@ def _proved(linear: Linearization, resistance: Array, body: RigidBody, system: S
     status = jnp.broadcast_to(resistance, linear.status.shape)
     broken = (linear.status == Status.INVALID.value)[..., None, None]
     system = system._replace(B_c=jnp.where(broken, 0.0, system.B_c), A_c=jnp.where(broken, 0.0, system.A_c))
-    m, cut = system.A_c.shape[-1], rank_tolerance(system.A_c.dtype)
+    m = system.A_c.shape[-1]
 
-    reduced = jnp.concatenate([system.B_c, system.A_c @ system.B_c], axis=-1)
-    reduced_rank, values = _rank(reduced, cut)
-    alone, _ = _rank(system.B_c, cut)
+    values, left = left_svd(jnp.concatenate([system.B_c, system.A_c @ system.B_c], axis=-1))
+    reduced_rank, alone = _rank(values), _rank(singular_values(system.B_c))
+    # [B A B A^2 B A^3 B] has [B_c A_c B_c] in its upper and in its lower rows and nothing else; A^4 = 0.
+    rank = 2 * reduced_rank
     A, B = first_order(system.A_c, system.B_c)
-    rank, _ = _rank(controllability_matrix(A, B)[..., : 4 * B.shape[-1]], cut)  # A^4 = 0
 
     full = reduced_rank == m
     verdict = _verdict(linear.status, status, full)
     unknown = verdict == Status.INVALID.value
-    motion = _least_worked(reduced, body, system)
+    motion = _least_worked(left[..., -1], body, system)
     weakest, effort = _weakest(A, B, system)
     none = unknown[..., None]
     return Controllability(
@@ -214,12 +211,11 @@ def _units(system: Scaled, dimension: int) -> Array:
     return jnp.stack([system.length] * dimension + [one] * turns, axis=-1)
 
 
-def _least_worked(reduced: Array, body: RigidBody, system: Scaled) -> Array:
-    """xi with ``xi . M [B_c A_c B_c]`` zero, or least: M^-1 times the last left singular vector's wrench.
+def _least_worked(left: Array, body: RigidBody, system: Scaled) -> Array:
+    """xi with ``xi . M [B_c A_c B_c]`` zero, or least: M^-1 times the wrench ``left``, its last left singular vector.
 
     Its part in M-orthogonal terms is the motion that no controllable one takes part in.
     """
-    left = jnp.linalg.svd(reduced, full_matrices=True)[0][..., -1]
     d = body.dimension
     size = (body.mass * system.length**2)[..., None, None]
     inverse = body.where(body.valid).inverse_inertia * size
@@ -231,9 +227,9 @@ def _least_worked(reduced: Array, body: RigidBody, system: Scaled) -> Array:
 
 
 def _weakest(A: Array, B: Array, system: Scaled) -> tuple[Array, Array]:
-    values, vectors = jnp.linalg.eigh(gramian(A, B))
-    least, state = values[..., 0], vectors[..., 0]
-    resolved = least > 4 * A.shape[-1] * jnp.finfo(A.dtype).eps * values[..., -1]
+    values, vectors = left_svd(gramian(A, B))  # its eigenvalues: it is positive semidefinite
+    least, state = values[..., -1], vectors[..., -1]
+    resolved = least > 4 * A.shape[-1] * jnp.finfo(A.dtype).eps * values[..., 0]
     effort = jnp.where(resolved, 1 / jnp.sqrt(jnp.where(resolved, least, 1.0) * HORIZON), jnp.inf)
     units = _units(system, 3 if A.shape[-1] == 12 else 2)
     both = jnp.concatenate([units, units / system.time[..., None]], axis=-1)

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
 
+from ..conic import solve
 from ..contacts import Grasp, grasp_map, nearest_admissible
 from ..core import Array, Bool, Float, Int, Status, applied
 from .computed_torque import Command, ContactController, Reference, tracking_error
@@ -40,7 +41,8 @@ def riccati(
     def double(_: int, now: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         A, G, H = now
         W = unit + G @ H
-        solved_A, solved_G = jnp.linalg.solve(W, A), jnp.linalg.solve(W, G)
+        solved = solve(W, jnp.concatenate([A, G], axis=-1))
+        solved_A, solved_G = solved[..., : A.shape[-1]], solved[..., A.shape[-1] :]
         G_next = G + A @ solved_G @ transposed(A)
         H_next = H + transposed(A) @ H @ solved_A
         return A @ solved_A, (G_next + transposed(G_next)) / 2, (H_next + transposed(H_next)) / 2
@@ -119,7 +121,7 @@ def _design(grasp: Grasp, system: Scaled, timestep: Array, weight: float) -> tup
     states, d = A.shape[-1], grasp.dimension
     unit = jnp.broadcast_to(jnp.eye(states, dtype=A.dtype), A.shape)
     X = riccati(A, B, unit, weight)
-    costate = X @ jnp.linalg.solve(unit + B @ jnp.swapaxes(B, -1, -2) @ X / weight, A)
+    costate = X @ solve(unit + B @ jnp.swapaxes(B, -1, -2) @ X / weight, A)
     scaled = jnp.swapaxes(B, -1, -2) @ costate / weight
     scaling = jnp.where(grasp.active[..., None], grasp.model.scaling(d), 0.0)
     scaling = scaling.reshape(*scaling.shape[:-2], -1)

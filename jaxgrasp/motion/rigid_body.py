@@ -16,6 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.typing import ArrayLike, DTypeLike
 
+from ..conic import eigenvalues
 from ..contacts import Grasp, grasp_map
 from ..core import (
     Array,
@@ -131,10 +132,10 @@ class RigidBody(eqx.Module):
         slack = 64 * unit_roundoff(self.dtype) * largest
         good = finite & (self.mass > 0)
         good &= jnp.max(jnp.abs(inertia - transposed), axis=(-1, -2)) <= slack
-        moments = jnp.linalg.eigvalsh((inertia + transposed) / 2)
-        good &= moments[..., 0] > slack
+        moments = eigenvalues((inertia + transposed) / 2)
+        good &= moments[..., -1] > slack
         if self.dimension == 3:
-            good &= moments[..., 2] <= moments[..., 0] + moments[..., 1] + slack
+            good &= moments[..., 0] <= moments[..., 1] + moments[..., 2] + slack
         return good
 
     @property

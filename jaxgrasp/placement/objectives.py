@@ -19,6 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import PyTree
 
+from ..conic import solve
 from ..contacts import Grasp
 from ..core import Array, ArrayLike, Float, wrench_dimension
 from ..quality import NORMS, effort_map, epsilon_quality, facet_normal, signed_supports, torque_lengths
@@ -135,7 +136,7 @@ def _floor(grasp: Grasp, length: Array, t: Array) -> Array:
     held = t > 0
     eye = jnp.eye(A.shape[-2], dtype=A.dtype)
     gram = jnp.where(held[..., None, None], jnp.einsum("...kan,...kbn->...ab", A, A), eye)
-    inverse = lax.stop_gradient(jnp.linalg.inv(lax.stop_gradient(gram)))
+    inverse = solve(lax.stop_gradient(gram), jnp.broadcast_to(eye, gram.shape))
     slope = jnp.einsum("...ab,...bc->...ac", inverse, inverse)  # d tr(M^-1) = -tr(M^-2 dM)
     change = jnp.sum(slope * (gram - lax.stop_gradient(gram)), axis=(-2, -1))
     sigma = 1 / jnp.sqrt(jnp.trace(inverse, axis1=-2, axis2=-1) - change)

@@ -24,6 +24,7 @@ from jax.typing import ArrayLike
 
 from ..backend import batched, in_chunks, is_traced, map_tiles
 from ..certificates import prove_epsilon, proved_by
+from ..conic import left_svd, solve
 from ..contacts import Grasp
 from ..core import Answer, Array, Bool, Float, Int, Status
 from ..resistance import WrenchResistance, wrench_resistance
@@ -107,7 +108,9 @@ def _seed(A: Array, internal: Array, active: Array, norm: str) -> tuple[Array, A
     A force v of norm r moves a contact's depth s_0 - |s_t| by at most sqrt(2) r, and the effort by sqrt(k) r (L1) or r.
     """
     k, m, n = A.shape
-    U, sigma, V = jnp.linalg.svd(jnp.moveaxis(A, 0, 1).reshape(m, k * n), full_matrices=False)
+    wide = jnp.moveaxis(A, 0, 1).reshape(m, k * n)
+    sigma, U = left_svd(wide)
+    V = (U.T @ wide) / jnp.where(sigma > 0, sigma, 1.0)[:, None]
     count = jnp.sum(active, dtype=A.dtype)
     most = jnp.max(internal[:, 0]) if norm == "Linf" else count
     half = internal / (2 * most)
@@ -125,7 +128,7 @@ def _normal_forces(polytope: Polytope) -> tuple[Array, Array]:
     nearest = jnp.argmax(jnp.sum(polytope.polar**2, axis=-1))
     a = polytope.polar[nearest]
     corner = polytope.corners[nearest]
-    weight = jnp.linalg.solve(polytope.points[corner].T, a / jnp.sum(a * a))
+    weight = solve(polytope.points[corner].T, (a / jnp.sum(a * a))[:, None])[:, 0]
     weight = jnp.maximum(weight, 0.0)
     weight = weight / jnp.sum(weight)
     return a / jnp.sqrt(jnp.sum(a * a)), jnp.einsum("c,ckn->kn", weight, polytope.labels[corner])

@@ -27,8 +27,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from ..conic import pseudo_inverse, singular_values
 from ..contacts import Grasp, length_scale
-from ..core import Answer, Array, Float, Int, Status, normalize, safe_root
+from ..core import Answer, Array, Float, Int, Status, normalize, rank_tolerance, safe_root
 from ..resistance import wrench_resistance
 from .unit_wrench_space import effort_map, scaled
 
@@ -76,11 +77,10 @@ def _norm(x: Array, axis: int = -1) -> Array:
 
 
 def _spectral(matrix: Array) -> Array:
-    """Largest singular value of (.., a, b), a at most 4: the root of the largest eigenvalue of M M^T."""
-    gram = jnp.einsum("...ab,...cb->...ac", matrix, matrix)
-    if gram.shape[-1] == 0:
-        return jnp.zeros(gram.shape[:-2], gram.dtype)
-    return jnp.sqrt(jnp.maximum(jnp.linalg.eigvalsh(gram)[..., -1], 1e-300))
+    """Largest singular value of (.., a, b); 0 for a = 0."""
+    if matrix.shape[-2] == 0:
+        return jnp.zeros(matrix.shape[:-2], matrix.dtype)
+    return singular_values(matrix)[..., 0]
 
 
 def _chord(r: Array) -> Array:
@@ -100,37 +100,57 @@ def _lever(position: Array) -> Array:
     return jnp.concatenate([eye, moment], axis=1)
 
 
-def _resistant_slack(data: _Data, resistant: Array, r: Array) -> Array:
+class _Response(NamedTuple):
+    """How far a unit of e_i moves the force of contact j through A^+, whatever the radius."""
+
+    turned_head: Array  # (j, i) |(A^+)_j,0 K_i|
+    turned_tail: Array  # (j, i) |(A^+)_j,t K_i|
+    head: Array  # (j,) |(A^+)_j,0| on torques
+    tail: Array  # (j,)
+    own: Array  # (j,) |(A^+)_j|
+    smallest: Array  # singular value of A
+
+
+def _response(data: _Data, resistant: Array) -> _Response:
+    A, d = data.A, data.position.shape[-1]
+    k, m, n = A.shape
+    wide = jnp.moveaxis(A, 0, 1).reshape(m, k * n)
+    wide = jnp.where(resistant, wide, jnp.eye(m, k * n, dtype=A.dtype))  # elsewhere the rank may be too low
+    inverse = pseudo_inverse(wide, rank_tolerance(A.dtype)).reshape(k, n, m)  # A^+, contact by contact
+    turned = jnp.einsum("jnm,imd->jind", inverse, _lever(data.position))
+    return _Response(
+        _norm(turned[:, :, 0]),
+        _spectral(turned[:, :, 1:]),
+        _norm(inverse[:, 0, d:]),
+        _spectral(inverse[:, 1:, d:]),
+        jnp.sqrt(jnp.sum(inverse**2, axis=(1, 2))),
+        singular_values(wide)[-1],
+    )
+
+
+def _resistant_slack(data: _Data, response: _Response, r: Array) -> Array:
     """The least depth left at radius r; positive: still resistant. Some finite number for grasps that never were."""
     A, active = data.A, data.active
-    k, m, n = A.shape
-    d = data.position.shape[-1]
+    n, d = A.shape[-1], data.position.shape[-1]
     c = _chord(r)
     s = data.force
     mu, gamma = data.friction, data.torsion
     pull = jnp.sqrt(s[:, 0] ** 2 + (mu * _norm(s[:, 1 : min(n, d)])) ** 2)  # |F_i|
     spin = jnp.abs(gamma * s[:, 3]) if n == 4 else jnp.zeros_like(pull)
-    wide = jnp.moveaxis(A, 0, 1).reshape(m, k * n)
-    gram = jnp.where(resistant, wide @ wide.T, jnp.eye(m, dtype=A.dtype))  # elsewhere it may be singular
-    inverse = jnp.linalg.solve(gram, wide).T.reshape(k, n, m)  # A^+, contact by contact
-    K = _lever(data.position)
     moved = r * pull + c * spin  # the torque a displaced, turned contact adds, besides its lever
     # e_i and its size
     sizes = c * pull * jnp.sqrt(1 + jnp.sum(data.position**2, axis=-1)) + moved
     total = jnp.sum(jnp.where(active, sizes, 0.0))
-    turned = jnp.einsum("jnm,imd->jind", inverse, K)
-    heads = c * pull * _norm(turned[:, :, 0]) + moved * _norm(inverse[:, 0, d:])[:, None]
-    tails = c * pull * _spectral(turned[:, :, 1:]) + moved * _spectral(inverse[:, 1:, d:])[:, None]
+    heads = c * pull * response.turned_head + moved * response.head[:, None]
+    tails = c * pull * response.turned_tail + moved * response.tail[:, None]
     loss = jnp.sum(jnp.where(active[None, :], heads + tails, 0.0), axis=1)
     # |E A^+|
     most = jnp.maximum(1.0, mu * (1 + r))
     arm = jnp.sqrt(1 + jnp.sum(data.position**2, axis=-1))
     change = r * most + arm * (c * most + r * mu) + c * gamma
     change = jnp.sqrt(jnp.sum(jnp.where(active, change**2, 0.0)))
-    smallest = jnp.sqrt(jnp.maximum(jnp.linalg.eigvalsh(gram)[0], 1e-300))
-    q = change / smallest
-    own = jnp.sqrt(jnp.sum(inverse**2, axis=(1, 2)))
-    second = jnp.sqrt(jnp.asarray(2.0, A.dtype)) * own * total * q / jnp.where(q < 1, 1 - q, 1.0)
+    q = change / response.smallest
+    second = jnp.sqrt(jnp.asarray(2.0, A.dtype)) * response.own * total * q / jnp.where(q < 1, 1 - q, 1.0)
     depth = s[:, 0] - _norm(s[:, 1:]) / (1 - r) - loss - second
     depth = jnp.min(jnp.where(active, depth, jnp.inf))
     return jnp.where(q < 1, depth, -1.0)
@@ -155,16 +175,18 @@ def _escaping_slack(data: _Data, r: Array) -> Array:
     return jnp.min(jnp.where(data.active, slack, jnp.inf))
 
 
-def _slack(data: _Data, resistant: Array, r: Array) -> Array:
-    return jnp.where(resistant, _resistant_slack(data, resistant, r), _escaping_slack(data, r))
+def _slack(data: _Data, response: _Response, resistant: Array, r: Array) -> Array:
+    return jnp.where(resistant, _resistant_slack(data, response, r), _escaping_slack(data, r))
 
 
 @jax.custom_jvp
 def _radius(data: _Data, resistant: Array) -> Array:
+    response = _response(data, resistant)
+
     def halve(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = (low + high) / 2
-        good = _slack(data, resistant, middle) > 0
+        good = _slack(data, response, resistant, middle) > 0
         return jnp.where(good, middle, low), jnp.where(good, high, middle)
 
     zero = jnp.zeros((), data.A.dtype)
@@ -178,8 +200,12 @@ def _radius_jvp(primals, tangents):
     r = _radius(data, resistant)
     inside = (r > 0) & (r < 0.999 * LARGEST)
     at = jnp.where(inside, r, 0.25)
-    _, by_data = jax.jvp(lambda x: _slack(x, resistant, at), (data,), (tangents[0],))
-    _, by_r = jax.jvp(lambda x: _slack(data, resistant, x), (at,), (jnp.ones_like(at),))
+
+    def slack(data: _Data, r: Array) -> Array:
+        return _slack(data, _response(data, resistant), resistant, r)
+
+    _, by_data = jax.jvp(lambda x: slack(x, at), (data,), (tangents[0],))
+    _, by_r = jax.jvp(lambda x: slack(data, x), (at,), (jnp.ones_like(at),))
     sound = inside & (by_r < 0)
     return r, jnp.where(sound, -by_data / jnp.where(sound, by_r, 1.0), 0.0)
 
@@ -196,11 +222,25 @@ def guaranteed_radius(grasp: Grasp) -> GuaranteedRadius:
     if not isinstance(grasp, Grasp):
         raise ValueError(f"guaranteed_radius takes a jaxgrasp.Grasp, got {type(grasp).__name__}")
     verdict = wrench_resistance(grasp, tolerance=TOLERANCE)
-    return _guarantee(grasp, verdict.status, verdict.internal_force, verdict.escape_twist, verdict.margin)
+    data, kind, length = _problem(
+        grasp, verdict.status, verdict.internal_force, verdict.escape_twist, verdict.margin
+    )
+    return GuaranteedRadius(verdict.status, _radii(data, kind).reshape(grasp.batch_shape), length)
+
+
+class _Kind(NamedTuple):
+    """(N,) bool: which guarantee a grasp gets; neither of the two where it rests on rank alone or is open."""
+
+    valid: Array
+    resistant: Array
+    escaping: Array
 
 
 @jax.jit
-def _guarantee(grasp: Grasp, status: Array, force: Array, twist: Array, margin: Array) -> GuaranteedRadius:
+def _problem(
+    grasp: Grasp, status: Array, force: Array, twist: Array, margin: Array
+) -> tuple[_Data, _Kind, Array]:
+    """The grasps as rows, harmless numbers where nothing is guaranteed; and L with the batch axes in front."""
     d, batch = grasp.dimension, grasp.batch_shape
     length = length_scale(grasp)
     valid = status != Status.INVALID.value
@@ -230,7 +270,11 @@ def _guarantee(grasp: Grasp, status: Array, force: Array, twist: Array, margin: 
         s,
         jnp.where(valid[..., None], scaled_twist, 0.0),
     )
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(batch) :]), (data, resistant))
-    radius = jax.vmap(_radius)(*flat).reshape(batch)
-    radius = jnp.where(resistant | escaping, radius, 0.0)
-    return GuaranteedRadius(status, jnp.where(valid, radius, jnp.nan), length)
+    kind = _Kind(valid, resistant, escaping)
+    return *jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(batch) :]), (data, kind)), length
+
+
+@jax.jit
+def _radii(data: _Data, kind: _Kind) -> Array:
+    radius = jax.vmap(_radius)(data, kind.resistant)
+    return jnp.where(kind.valid, jnp.where(kind.resistant | kind.escaping, radius, 0.0), jnp.nan)

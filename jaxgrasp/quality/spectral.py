@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
+from ..conic import singular_values
 from ..contacts import Grasp, grasp_map
 from ..core import Array, Float, wrench_dimension
 from .unit_wrench_space import torque_lengths
@@ -20,9 +21,7 @@ def _singular_values(grasp: Grasp, torque_scale: Any) -> Array:
     m = wrench_dimension(grasp.dimension)
     length = torque_lengths(grasp, torque_scale)
     rows = jnp.where(jnp.arange(m) < grasp.dimension, 1.0, 1 / length[..., None])
-    values = jnp.linalg.svd(grasp_map(grasp) * rows[..., None], compute_uv=False)
-    missing = m - values.shape[-1]
-    return jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)])
+    return singular_values(grasp_map(grasp) * rows[..., None])
 
 
 def grasp_isotropy(

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import lax
 
+from ..conic import solve
 from ..core import Array, stationary_tolerance
 
 __all__ = ["Touch", "weakest_direction"]
@@ -145,7 +146,7 @@ def _newton(A: Array, norm: str, near: Touch, upper: Array, core_below: Array, e
 
     def step(_: int, x: Array) -> Array:
         residual, matrix = system(x)
-        return x - jnp.linalg.solve(matrix, residual)
+        return x - solve(matrix, residual[:, None])[:, 0]
 
     start = jnp.concatenate([
         near.direction, (near.direction @ (system.wide @ near.forces.reshape(-1)))[None], near.forces.reshape(-1)

@@ -8,9 +8,19 @@ from typing import Any
 import numpy as np
 
 from ..contacts import Grasp, component_names, contact_model
-from ..core import Status, UserError
+from ..core import Status, UserError, wrench_dimension
 
 __all__ = ["ForceAnswer", "StoredGrasp", "Verdict"]
+
+MAY_LACK = (
+    "rank",
+    "force",
+    "twist",
+    "bound_twist",
+    "contact_force",
+    "escape_twist",
+    "load_twist",
+)  # None: there is none
 
 
 @dataclass(frozen=True)
@@ -27,6 +37,21 @@ class StoredGrasp:
     active: np.ndarray
     centre_of_mass: np.ndarray
     model: str
+
+    def __post_init__(self):
+        """UserError where the parts do not fit each other: the row of a damaged file."""
+        d, k = len(self.centre_of_mass), len(self.position)
+        for name, shape in self._shapes(k, d, len(self.components)).items():
+            value = getattr(self, name)
+            if value is None and name in MAY_LACK:
+                continue
+            there = getattr(value, "shape", ())  # of a number: ()
+            if value is None or there != shape:
+                raise UserError(f"the row is damaged: {name} has the shape {there}, not {shape}")
+
+    def _shapes(self, k: int, d: int, n: int) -> dict[str, tuple[int, ...]]:
+        shapes: dict[str, tuple[int, ...]] = {"position": (k, d), "normal": (k, d)}
+        return shapes | dict.fromkeys(("friction", "torsion", "active"), (k,))
 
     @property
     def size(self) -> float:
@@ -72,13 +97,25 @@ class Verdict(StoredGrasp):
     twist: np.ndarray | None
     bound_twist: np.ndarray | None = None
 
+    def _shapes(self, k: int, d: int, n: int) -> dict[str, tuple[int, ...]]:
+        own = {
+            "centre_of_mass": (3,),
+            "force": (k, n),
+            "twist": (6,),
+            "bound_twist": (6,),
+            "margin": (),
+            "upper": (),
+            "rank": (),
+        }
+        return super()._shapes(k, 3, n) | own
+
     @classmethod
     def from_row(cls, row: dict[str, Any], metadata: dict[str, Any]) -> Verdict:
         """From what ``formats.parquet.read_row`` returns."""
         try:
             com, kind = np.asarray(metadata["centre_of_mass"], float), metadata["model"]["kind"]
             components = len(component_names(kind, 3))
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise UserError(
                 "the file's metadata lack the centre of mass or the model; screen it again"
             ) from error
@@ -86,24 +123,32 @@ class Verdict(StoredGrasp):
             status = Status(row["status"])
         except ValueError as error:
             raise UserError(f"the row's status, {row['status']}, is none that this jaxgrasp knows") from error
-        force = row["internal_force"]
-        position = np.asarray(row["position"], float).reshape(-1, 3)
-        return cls(
-            position=position,
-            normal=np.asarray(row["normal"], float).reshape(-1, 3),
-            friction=np.asarray(row["friction"], float),
-            torsion=np.asarray(row["torsion"], float),
-            active=np.asarray(row["active"], bool),
-            centre_of_mass=com,
-            model=kind,
-            status=status,
-            margin=float("nan") if row["margin"] is None else row["margin"],
-            upper=float("nan") if row["upper"] is None else row["upper"],
-            rank=row["rank"],
-            force=None if force is None else np.asarray(force, float).reshape(len(position), components),
-            twist=None if row["escape_twist"] is None else np.asarray(row["escape_twist"], float),
-            bound_twist=None if row.get("bound_twist") is None else np.asarray(row["bound_twist"], float),
-        )
+
+        def real(value: Any, *shape: int) -> Any:
+            return None if value is None else np.asarray(value, float).reshape(shape or np.shape(value))
+
+        try:
+            position = real(row["position"], -1, 3)
+            return cls(
+                position=position,
+                normal=real(row["normal"], -1, 3),
+                friction=real(row["friction"]),
+                torsion=real(row["torsion"]),
+                active=np.asarray(row["active"], bool),
+                centre_of_mass=com,
+                model=kind,
+                status=status,
+                margin=float("nan") if row["margin"] is None else float(row["margin"]),
+                upper=float("nan") if row["upper"] is None else float(row["upper"]),
+                rank=None if row["rank"] is None else int(row["rank"]),
+                force=real(row["internal_force"], len(position), components),
+                twist=real(row["escape_twist"]),
+                bound_twist=real(row.get("bound_twist")),
+            )
+        except UserError:
+            raise
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(f"the row is damaged ({error})") from error
 
 
 @dataclass(frozen=True)
@@ -124,6 +169,15 @@ class ForceAnswer(StoredGrasp):
     escape_twist: np.ndarray | None
     load_twist: np.ndarray | None
 
+    def _shapes(self, k: int, d: int, n: int) -> dict[str, tuple[int, ...]]:
+        m = wrench_dimension(d)
+        twists = dict.fromkeys(("escape_twist", "load_twist", "wrench"), (m,))
+        return (
+            super()._shapes(k, d, n)
+            | twists
+            | {"force": (k, n), "contact_force": (k, d), "cost": (), "lower": ()}
+        )
+
     @classmethod
     def from_row(cls, row: dict[str, Any], metadata: dict[str, Any]) -> ForceAnswer:
         """From a row of a file of forces (``formats.force_table``) and the file's metadata."""
@@ -132,7 +186,7 @@ class ForceAnswer(StoredGrasp):
             force = None if row["force"] is None else np.reshape(row["force"], (k, -1))
             com, kind = np.asarray(metadata["centre_of_mass"], float), metadata["model"]["kind"]
             component_names(kind, len(com))  # KeyError for a model that we do not know
-            names = ("row", "grasp_id", "contact_force", "escape_twist", "load_twist", "cost", "lower")
+            names = ("contact_force", "escape_twist", "load_twist")
             said = ("load", "criterion", "max_normal", "tolerance")
             return cls(
                 **{
@@ -144,9 +198,13 @@ class ForceAnswer(StoredGrasp):
                 model=kind,
                 status=Status(row["status"]),
                 force=force,
-                **{name: row[name] for name in names},
+                **{name: None if row[name] is None else np.asarray(row[name], float) for name in names},
+                **{name: int(row[name]) for name in ("row", "grasp_id")},
+                **{name: float(row[name]) for name in ("cost", "lower")},
                 **{name: metadata[name] for name in said},
             )
+        except UserError:
+            raise
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"the file of forces is damaged or incomplete ({error})") from error
 
