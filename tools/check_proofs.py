@@ -1,6 +1,6 @@
 """Checks proofs of grasps that ``jaxgrasp prove`` wrote, with the standard library of Python and exact arithmetic.
 
-    python check_proofs.py proofs.jsonl [--quiet]
+    python check_proofs.py proofs.jsonl
 
 A line is the proof of one grasp, JSON. Its numbers are hexadecimal floats ("0x1.8p-4"); where a number needs more than
 53 bits it is a list of floats, whose exact sum is meant. Everything is then a fraction, and nothing is rounded:
@@ -14,8 +14,7 @@ A contact can only push, with tangential forces up to friction: F . n > 0 and, w
     |f_t|^2 / mu^2 + |s n|^2 / gamma^2 <= f_n^2                                               (1)
 
 RESISTANT      sum F_i = 0 and sum p_i x F_i + s_i n_i = 0, (1) holds strictly at every contact, and the contact forces
-               span all six directions of force and torque (three in the plane). Then every load can be held: add a
-               large multiple of these forces to any forces, friction aside, that balance it.
+               span all six directions of force and torque (three in the plane): then every load can be held.
 NOT_RESISTANT  at every contact u . n >= 0 and (u . n)^2 >= mu^2 |u_t|^2 |n|^2 + gamma^2 (w . n)^2: no admissible force
                does negative work on the twist, so no load that does positive work can be held. "to rounding": not these
                numbers but some within ``within`` of them (of the largest |p_i|; of 1 for mu; in radians for normals).
@@ -38,7 +37,7 @@ DIGITS = 60
 
 
 class Refused(Exception):
-    """The line proves nothing; the text says why."""
+    pass
 
 
 def require(holds, why):
@@ -109,7 +108,7 @@ class Grasp:
         require(isinstance(line.get("position"), list), "position is missing")
         self.k = k = len(line["position"])
         require(1 <= k <= MOST_CONTACTS, "1 to 1000 contacts")
-        flat = [[Q(0)] if d == 2 else []][0]
+        flat = [Q(0)] * (3 - d)
         self.p = [x + flat for x in vectors(line["position"], k, d, "position")]
         self.n = [x + flat for x in vectors(line.get("normal"), k, d, "normal")]
         self.mu, self.gamma = (numbers(line.get(name), k, name) for name in ("friction", "torsion"))
@@ -125,7 +124,7 @@ class Grasp:
                 yield [Q(0)] * 3 + n
 
     def forces(self, line):
-        d, flat = self.dimension, [Q(0)] if self.dimension == 2 else []
+        d, flat = self.dimension, [Q(0)] * (3 - self.dimension)
         force = [x + flat for x in vectors(line.get("force"), self.k, d, "force")]
         spin = numbers(line.get("spin"), self.k, "spin")
         total = [Q(0)] * 6
@@ -161,7 +160,9 @@ def check_resistant(grasp, line):
     for i, (f, s) in enumerate(zip(*grasp.forces(line))):
         h, square, _ = grasp.cone(i, f, s)
         require(h > 0 and square < h * h, f"contact {i}: the force is not inside the cone")
-    require(rank(grasp.columns()) == (6 if grasp.dimension == 3 else 3), "the contacts do not span all wrenches")
+    require(
+        rank(grasp.columns()) == (6 if grasp.dimension == 3 else 3), "the contacts do not span all wrenches"
+    )
 
 
 def check_escape(grasp, line):
@@ -184,28 +185,35 @@ def check_escape(grasp, line):
         require(within and (moved or slides or smooth), f"contact {i} can oppose the twist")
 
 
+def enclosed(cones):
+    """Of (h, y^2, |n|^2): h / |n| between two fractions, and y / |n| rounded up."""
+    heads, tails = [], []
+    for h, square, nn in cones:
+        low, high = root(h * h / nn, False), root(h * h / nn, True)
+        heads.append((low, high) if h >= 0 else (-high, -low))
+        tails.append(root(square / nn, True))
+    return heads, tails
+
+
 def check_margin(grasp, line):
     ends = line.get("margin", [None, None])
     require(isinstance(ends, list) and len(ends) == 2, "margin: two numbers or null")
     lower, upper = (None if x is None else number(x) for x in ends)
     if lower is not None:
-        heads, tails = [], []
-        for i, (f, s) in enumerate(zip(*grasp.forces(line))):
-            h, square, nn = grasp.cone(i, f, s)
-            low, high = root(h * h / nn, False), root(h * h / nn, True)
-            heads.append((low, high) if h >= 0 else (-high, -low))
-            tails.append(root(square / nn, True))
+        cones = (grasp.cone(i, f, s) for i, (f, s) in enumerate(zip(*grasp.forces(line))))
+        heads, tails = enclosed(cones)
         total = [sum(x) for x in zip(*heads)]
         require(total[0] > 0, "the forces do not press")
         most = lower * total[1 if lower >= 0 else 0]
-        require(all(grasp.k * (h[0] - t) >= most for h, t in zip(heads, tails)), "the forces do not show lower")
+        require(
+            all(grasp.k * (h[0] - t) >= most for h, t in zip(heads, tails)), "the forces do not show lower"
+        )
     if upper is not None and upper < 1:
-        twist, heads, tails = grasp.twist(line, "bound_twist"), [], []
-        for i in range(grasp.k):
+        twist, cones = grasp.twist(line, "bound_twist"), []
+        for i, (mu, gamma) in enumerate(zip(grasp.mu, grasp.gamma)):
             h, slide, about, _, nn = grasp.motion(i, twist)
-            low, high = root(h * h / nn, False), root(h * h / nn, True)
-            heads.append((low, high) if h >= 0 else (-high, -low))
-            tails.append(root((grasp.mu[i] ** 2 * slide + (grasp.gamma[i] * about) ** 2) / nn, True))
+            cones.append((h, mu**2 * slide + (gamma * about) ** 2, nn))
+        heads, tails = enclosed(cones)
         require(sum(h[0] for h in heads) > 0, "the bound twist shows nothing")
         total = sum(h[0 if upper >= 0 else 1] for h in heads)
         each = (upper * total + (1 - upper) * grasp.k * (h[0] - t) for h, t in zip(heads, tails))
@@ -229,42 +237,40 @@ def check(text):
     elif claim == "NOT_RESISTANT":
         check_escape(grasp, line)
     else:
-        require(claim == "MARGINAL" and None not in (lower, upper), "claim: RESISTANT, NOT_RESISTANT or MARGINAL")
+        require(
+            claim == "MARGINAL" and None not in (lower, upper), "claim: RESISTANT, NOT_RESISTANT or MARGINAL"
+        )
         require(max(abs(lower), abs(upper)) < Q(1, 1000), "the margin is not small")
-        require(rank(grasp.columns()) == (6 if grasp.dimension == 3 else 3), "the contacts do not span all wrenches")
+        require(
+            rank(grasp.columns()) == (6 if grasp.dimension == 3 else 3),
+            "the contacts do not span all wrenches",
+        )
     return f"{claim} {line['proof']}"
 
 
 def lines_of(file):
-    """The lines; None for one that is too long, of which no more than the longest is read."""
+    """The lines; of one that is too long its beginning, and no more is kept."""
     while line := file.readline(LONGEST_LINE + 1):
-        whole = line.endswith(b"\n") or len(line) <= LONGEST_LINE
-        if not whole:
-            while (rest := file.readline(LONGEST_LINE)) and not rest.endswith(b"\n"):
-                pass
-        yield line.decode("utf-8", "replace") if whole else None
+        rest = line
+        while rest and not rest.endswith(b"\n"):
+            rest = file.readline(LONGEST_LINE)
+        yield line.decode("utf-8", "replace")
 
 
-def main(arguments):
-    paths = [a for a in arguments if a != "--quiet"]
+def main(paths):
     if len(paths) != 1:
         print(__doc__.split("\n\n")[1].strip())
         return 2
     counts, bad = {}, 0
-    try:
-        with open(paths[0], "rb") as file:
-            for place, text in enumerate(lines_of(file), 1):
-                try:
-                    require(text is not None, f"longer than {LONGEST_LINE} characters")
-                    told = check(text)
-                    counts[told] = counts.get(told, 0) + 1
-                except Refused as why:
-                    bad += 1
-                    if "--quiet" not in arguments:
-                        print(f"line {place}: REFUSED: {why}")
-    except OSError as error:
-        print(f"{paths[0]}: {error.strerror}")
-        return 2
+    with open(paths[0], "rb") as file:
+        for place, text in enumerate(lines_of(file), 1):
+            try:
+                require(len(text) <= LONGEST_LINE, f"longer than {LONGEST_LINE} characters")
+                told = check(text)
+                counts[told] = counts.get(told, 0) + 1
+            except Refused as why:
+                bad += 1
+                print(f"line {place}: REFUSED: {why}")
     for told, count in sorted(counts.items()):
         print(f"{count:>10}  {told}")
     print(f"{bad:>10}  REFUSED")

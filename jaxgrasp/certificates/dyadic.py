@@ -172,7 +172,9 @@ def exact_grasp(
     normals = [triple(numbers) for numbers, _ in rows]
     mu, mu_exponent = integers(friction)
     squares = [dot(n, n) for n in normals]
-    return ExactGrasp(d, points, normals, squares, mu, lengths[d * k :], exponent, [e for _, e in rows], mu_exponent)
+    return ExactGrasp(
+        d, points, normals, squares, mu, lengths[d * k :], exponent, [e for _, e in rows], mu_exponent
+    )
 
 
 def twist_of(grasp: ExactGrasp, numbers: np.ndarray) -> Twist:

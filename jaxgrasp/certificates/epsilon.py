@@ -60,7 +60,9 @@ def prove_epsilon(grasp, answer, tolerance: float | None = None) -> Proof:
             if known.valid[lane]:
                 found = _Lane(known, claim, lane, dimension, eps, room).proved()
                 level[lane], distance[lane], lower[lane], upper[lane] = found
-            elif claim.status[lane] == INVALID and np.isnan(claim.lower[lane]) and np.isnan(claim.upper[lane]):
+            elif (
+                claim.status[lane] == INVALID and np.isnan(claim.lower[lane]) and np.isnan(claim.upper[lane])
+            ):
                 level[lane] = 2
     distance = np.where(level == 2, 0.0, np.where(level == 1, distance, np.inf))
     parts = (LEVELS[level], distance, lower, upper, np.zeros(lanes))
@@ -163,7 +165,10 @@ class _Lane:
         known, lane = self.known, self.lane
         live = self.live
         grasp = exact_grasp(
-            known.position[lane][live], known.normal[lane][live], known.friction[lane][live], known.torsion[lane][live]
+            known.position[lane][live],
+            known.normal[lane][live],
+            known.friction[lane][live],
+            known.torsion[lane][live],
         )
         xi, scaled = -self.claim.direction[lane] * self.row_scale, scaled_lane(known, lane, self.dimension)
         if escape_twist(grasp, scaled, xi) is not None:

@@ -84,7 +84,9 @@ class ExactLane:
         if upper == -np.inf:
             return independent(self.grasp.unit_wrenches()[0]) or moves_all_alike(self.grasp)
         known = np.isfinite(self.bound).all()
-        return bool(known) and any(margin_at_most(self.grasp, self.scaled, self.bound, upper, d) for d in DIGITS)
+        return bool(known) and any(
+            margin_at_most(self.grasp, self.scaled, self.bound, upper, d) for d in DIGITS
+        )
 
     def at_least_nearby(self, lower: float) -> float:
         """How far a map lies, relatively, that has the internal force s itself, if s shows ``lower``; else infinite."""

@@ -159,7 +159,9 @@ def _inwards(
     gram = np.where(good[:, None, None], gram, 0.0) + ridge + idle_rows[:, None] * np.eye(gram.shape[-1])
     weights = np.linalg.solve(gram, right[..., None])[..., 0]
     d = np.einsum("lrj,lr->lj", system, np.where(np.isfinite(weights), weights, 0.0)).reshape(s.shape)
-    d = d - np.einsum("lji,li->lj", inverse, np.einsum("lij,lj->li", asked.known.A, d.reshape(lanes, -1))).reshape(s.shape)
+    d = d - np.einsum(
+        "lji,li->lj", inverse, np.einsum("lij,lj->li", asked.known.A, d.reshape(lanes, -1))
+    ).reshape(s.shape)
     rates = np.einsum("lrj,lj->lr", rows, d.reshape(lanes, -1)) * active
     cone, cap = rates[:, :k], rates[:, k : 2 * k]
     return d, (cone, cap, rates[:, 2 * k :] * reach)

@@ -6,6 +6,7 @@ exact sum is meant. Forces and twists may be multiplied by any positive number, 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,13 +24,15 @@ HOW = {EXACTLY: "exactly", TO_ROUNDING: "to rounding"}
 
 
 def _parts(value: int, exponent: int) -> str | list[str]:
-    """``value 2^exponent`` as hexadecimal floats whose sum it is."""
+    """``value 2^exponent`` as hexadecimal floats whose sum it is; OverflowError where floats do not reach as far."""
     parts = []
     while value:
         shift = max(abs(value).bit_length() - 53, 0)
         head = abs(value) >> shift
         signed = head if value > 0 else -head
-        parts.append((float(signed) * 2.0 ** (shift + exponent)).hex())
+        if shift + exponent < -1074:
+            raise OverflowError("numbers of too different sizes")
+        parts.append(math.ldexp(signed, shift + exponent).hex())
         value -= signed << shift
     return parts[0] if len(parts) == 1 else parts or "0x0.0p+0"
 
@@ -45,7 +48,8 @@ def _hex(array: np.ndarray) -> list[Any]:
 
 
 def proof_lines(grasp, answer, proof: Proof) -> list[dict[str, Any] | None]:
-    """One object for each lane of ``grasp`` (N,), None where there is no verdict or its proof was refused.
+    """One object for each lane of ``grasp`` (N,), None where there is no verdict, its proof was refused, or
+    its numbers differ too much in size to be sums of floats.
 
     proof  what ``prove(grasp, answer)`` said
     """
@@ -60,7 +64,10 @@ def proof_lines(grasp, answer, proof: Proof) -> list[dict[str, Any] | None]:
             continue
         lane = ExactLane(known, i, dimension, sized.s[i], sized.escape[i], sized.bound[i], nearby)
         ends = float(claim.lower[i]), float(claim.upper[i])
-        out.append(_line(lane, CLAIMS[status], ends) | _numbers(known, i))
+        try:
+            out.append(_line(lane, CLAIMS[status], ends) | _numbers(known, i))
+        except OverflowError:
+            out.append(None)
     return out
 
 
@@ -68,7 +75,9 @@ def _numbers(known, i: int) -> dict[str, Any]:
     """The numbers that are given: contacts that count, positions about the centre of mass."""
     live = known.live[i]
     names = ("position", "normal", "friction", "torsion")
-    return {"dimension": known.position.shape[-1]} | {name: _hex(getattr(known, name)[i][live]) for name in names}
+    return {"dimension": known.position.shape[-1]} | {
+        name: _hex(getattr(known, name)[i][live]) for name in names
+    }
 
 
 def _line(lane: ExactLane, claim: str, ends: tuple[float, float]) -> dict[str, Any]:
@@ -96,7 +105,10 @@ def _forces(lane: ExactLane) -> dict[str, Any]:
     d, exponent = lane.grasp.dimension, lane.grasp.length_exponent
     rows, largest = _rows(forces.force, d)
     # An integer torque is spin N, lengths in units of 2^exponent, N = n / 2^(exponent of n).
-    spins = [_parts(s, exponent - e - largest) for s, e in zip(forces.spin, lane.grasp.normal_exponent, strict=True)]
+    spins = [
+        _parts(s, exponent - e - largest)
+        for s, e in zip(forces.spin, lane.grasp.normal_exponent, strict=True)
+    ]
     return {"force": rows, "spin": spins}
 
 

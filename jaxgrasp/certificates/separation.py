@@ -61,13 +61,18 @@ def _in_integers(
     """A twist near the given one that no contact can oppose, and the work of the load along it."""
     known, live = asked.known, asked.known.live[lane]
     grasp = exact_grasp(
-        known.position[lane][live], known.normal[lane][live], known.friction[lane][live], known.torsion[lane][live]
+        known.position[lane][live],
+        known.normal[lane][live],
+        known.friction[lane][live],
+        known.torsion[lane][live],
     )
     scaled = scaled_lane(known, lane, asked.dimension)
     exact = escape_twist(grasp, scaled, twist)
     if exact is not None:
         return (2, 0.0) if _power(grasp, exact, wrench) > 0 else (0, np.inf)
-    clear = float(twist @ asked.load[lane]) > 64 * nearby * float(np.linalg.norm(twist) * np.linalg.norm(asked.load[lane]))
+    clear = float(twist @ asked.load[lane]) > 64 * nearby * float(
+        np.linalg.norm(twist) * np.linalg.norm(asked.load[lane])
+    )
     distance = rounding_distance(grasp, scaled, twist, known.friction[lane][live])
     return (1, distance) if clear and distance <= nearby else (0, np.inf)
 

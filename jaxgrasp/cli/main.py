@@ -14,6 +14,7 @@ from ..core import UserError
 from .check import CHECK_HELP, check
 from .forces import FORCES_HELP, explain_forces, forces
 from .place import PLACE_HELP, place
+from .prove import PROVE_HELP, prove
 from .screen import SCREEN_HELP, screen
 from .terminal import say
 
@@ -63,6 +64,7 @@ app.command(help=SCREEN_HELP)(screen)
 app.command(help=FORCES_HELP)(forces)
 app.command(help=CHECK_HELP)(check)
 app.command(help=PLACE_HELP)(place)
+app.command(help=PROVE_HELP)(prove)
 
 
 @app.command(help=EXPLAIN_HELP)

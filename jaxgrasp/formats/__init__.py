@@ -17,6 +17,7 @@ from .parquet import (
     verdict_table,
     write,
 )
+from .stored_verdicts import StoredVerdicts
 
 __all__ = [
     "METADATA_KEY",
@@ -26,6 +27,7 @@ __all__ = [
     "Forces",
     "GraspFile",
     "SavedGrasps",
+    "StoredVerdicts",
     "Verdicts",
     "as_row",
     "check_schema",

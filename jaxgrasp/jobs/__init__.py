@@ -7,6 +7,7 @@ from .forces_request import ForcesPlan, ForcesRequest, plan_forces
 from .outputs import writable
 from .place import Placed, draw_best, place
 from .place_request import PlacePlan, PlaceRequest, plan_place
+from .prove import ProofSummary, prove_verdicts
 from .screen import screen
 from .screen_request import ScreenPlan, ScreenRequest, plan_screen
 from .summary import ForceSummary, Summary
@@ -20,6 +21,7 @@ __all__ = [
     "PlacePlan",
     "PlaceRequest",
     "Placed",
+    "ProofSummary",
     "ScreenPlan",
     "ScreenRequest",
     "Summary",
@@ -33,6 +35,7 @@ __all__ = [
     "plan_forces",
     "plan_place",
     "plan_screen",
+    "prove_verdicts",
     "screen",
     "writable",
 ]
