@@ -150,7 +150,7 @@ def cost_change(asked: Asked, s: np.ndarray, shift: np.ndarray) -> np.ndarray:
         a, b, _ = _log_det_terms(asked)
         head = np.where(known.live, s[..., 0], 1.0)
         gap = head - np.linalg.norm(s[..., 1:], axis=-1)
-        # Twice the derivative of a log f_n + b log((f_n - psi) (f_n + psi)), as long as the change is small beside both.
+        # Twice the derivative of a log f_n + b log((f_n - psi) (f_n + psi)), if the change is small beside both.
         slope = a / head + np.where(b > 0, 2 * b / np.where(b > 0, gap, 1.0), 0.0)
         slope = np.where(known.live, slope, 0.0)
         small = (shift[:, None] <= np.where(known.live, np.where(b > 0, gap, head), np.inf) / 4).all(-1)

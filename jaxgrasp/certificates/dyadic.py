@@ -132,7 +132,7 @@ class ExactGrasp(NamedTuple):
         return v[0] + turn[0], v[1] + turn[1], v[2] + turn[2]
 
     def dual_sides(self, i: int, twist: Twist) -> tuple[int, Fraction]:
-        """h = u . N and ``|N|^2 |(mu u_t, gamma omega_n)|^2``: none opposes the twist iff h >= 0 and h^2 is not smaller."""
+        """h = u . N and ``|N|^2 |(mu u_t, gamma omega_n)|^2``: the twist escapes iff h >= 0 and h^2 is not smaller."""
         n = self.normal[i]
         u, turn = self.velocity(i, twist), dot(twist.rotation, n)
         h = dot(u, n)

@@ -1,7 +1,7 @@
 """Both bounds of the Ferrari-Canny quality proved again.
 
-    lower          every vertex is the wrench of forces in their cones with unit effort, and the facets surround a ball of
-                   that radius (``polytope``); so the grasp is RESISTANT if it is positive
+    lower          every vertex is the wrench of forces in their cones with unit effort, and the facets surround a ball
+                   of that radius (``polytope``); so the grasp is RESISTANT if it is positive
     upper          h(direction), in closed form, is no larger
     NOT_RESISTANT  both bounds are 0, and ``direction`` is the negative of a twist that no contact can oppose
     touching       forces in their cones with unit effort at most

@@ -99,7 +99,7 @@ class ExactLane:
         return residual if shown >= lower - self.nearby else np.inf
 
     def at_most_nearby(self, upper: float) -> float:
-        """How far a map lies of which the bound twist shows t* = -inf: it moves all contacts alike, along their normals."""
+        """How far a map lies of which the bound twist shows t* = -inf: all contacts move alike, along their normals."""
         if upper != -np.inf or not np.isfinite(self.bound).all():
             return np.inf
         x = (self.scaled.A.T @ self.bound).reshape(self.s.shape)

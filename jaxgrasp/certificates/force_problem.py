@@ -18,7 +18,7 @@ SQUARED = ("SumOfSquares", "LeastNorm")
 
 
 class ForceProblem(NamedTuple):
-    """asked: the problem in units of ``unit`` (N,) newtons; shape: axes of the grasps and their loads; wrench (N, m)."""
+    """asked: in units of ``unit`` (N,) newtons; wrench (N, m) as given; shape: axes of the grasps and their loads."""
 
     asked: Asked
     wrench: np.ndarray
@@ -82,7 +82,7 @@ def _repeated(known: Rebuilt, loads: int) -> Rebuilt:
 
 
 def _load_limit(dtype: np.dtype) -> float:
-    """Loads in N (torques over L) are 0 or between this and its inverse, so that squares neither over- nor underflow."""
+    """Loads in N (torques over L) are 0 or between this and its inverse: squares neither over- nor underflow."""
     return 2.0 ** (np.finfo(dtype).maxexp // 2 - 2)
 
 

@@ -3,8 +3,9 @@
 With the folded map A (lengths over L), the forces s (f = mu s, gamma s, s), the load w and x_i = A_i^T y + J_i beta for
 the twist y and the joint rates beta of the answer:
 
-    OPTIMAL     the forces given are admissible and balance the load, to rounding; exact forces next to them cost no
-                more than ``upper``, the dual function at (y, beta), in closed form, reaches ``lower``, and both are close
+    OPTIMAL     the forces given are admissible and balance the load, to rounding; ``upper`` is what they cost, and exact
+                forces next to them cost hardly more; the dual function at (y, beta), in closed form, reaches
+                ``lower``; and both are close
     STALLED     the same of each end of the bracket that is finite
     INFEASIBLE  the load does more work along the escape twist than admissible forces can take up (``separation``)
     INVALID     the numbers are indeed no problem
@@ -38,7 +39,7 @@ CLOSE = 1e-6  # relative gap that OPTIMAL may leave
 
 
 class Claim(NamedTuple):
-    """What N lanes say, forces in the problem's units: s (N, k, n), twists (N, m) over L, rates (N, q), the rest (N,)."""
+    """What N lanes say, in the problem's units: s (N, k, n), twists (N, m) over L, rates (N, q), the rest (N,)."""
 
     status: np.ndarray
     s: np.ndarray

@@ -21,7 +21,7 @@ RAYS = 12
 
 
 def ball_inside(points: np.ndarray, facets: np.ndarray) -> float:
-    """The radius of a ball about the origin that the facets (F, m), numbers of the points (V, m), surround; 0 for none."""
+    """The radius of a ball about the origin that the facets (F, m) of the points (V, m) surround; 0 for none."""
     m = points.shape[1]
     if len(facets) <= m or facets.min() < 0 or facets.max() >= len(points) or not _closed(facets):
         return 0.0

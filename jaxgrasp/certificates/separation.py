@@ -14,7 +14,7 @@ import numpy as np
 
 from .criteria import Asked
 from .dyadic import ExactGrasp, Twist, exact_grasp, integers
-from .exact_force import Scaled, scaled_lane
+from .exact_force import scaled_lane
 from .exact_twist import escape_twist, rounding_distance
 from .rebuilt import EPS
 

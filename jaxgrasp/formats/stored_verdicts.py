@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
-
 from ..core import UserError
 from .contact_file import GraspFile
 from .lists import dense

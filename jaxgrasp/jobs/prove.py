@@ -40,7 +40,7 @@ class ProofSummary:
 def prove_verdicts(
     source: Path, output: Path | None = None, progress: Callable[[ProofSummary], None] | None = None
 ) -> ProofSummary:
-    """Prove all rows of ``source`` and write a line for each proved verdict to ``output``, SOURCE.proofs.jsonl by default.
+    """Prove all rows of ``source``; write a line for each proved verdict to ``output``, by default SOURCE.proofs.jsonl.
 
     progress  called with the running summary after every chunk
 
