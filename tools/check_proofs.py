@@ -99,7 +99,8 @@ class Grasp:
 
     def __init__(self, line):
         self.d, position = line.get("dimension"), line.get("position")
-        require(type(self.d) is int and self.d in (2, 3) and isinstance(position, list), "dimension 2 or 3, and positions are wanted")
+        require(type(self.d) is int and self.d in (2, 3), "dimension: 2 or 3")
+        require(isinstance(position, list), "positions are wanted")
         self.k = len(position)
         require(1 <= self.k <= MOST_CONTACTS, f"1 to {MOST_CONTACTS} contacts are read")
         self.p = vectors(position, self.k, self.d, "position")

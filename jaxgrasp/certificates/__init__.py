@@ -9,5 +9,6 @@ from .reading import Malformed
 from .resistance import prove_resistance
 
 __all__ = [
-    "Malformed", "Proof", "check", "proof_lines", "prove", "prove_epsilon", "prove_forces", "prove_resistance", "proved_by",
+    "Malformed", "Proof", "check", "proof_lines", "prove", "prove_epsilon", "prove_forces", "prove_resistance",
+    "proved_by",
 ]  # fmt: skip

@@ -3,7 +3,7 @@
 With the folded map A (lengths over L), the forces s (f = mu s, gamma s, s), the load w and x_i = A_i^T y + J_i beta for
 the twist y and the joint rates beta of the answer:
 
-    OPTIMAL     the forces given are admissible and balance the load, to rounding; ``upper`` is what they cost, and exact
+    OPTIMAL     the forces given are admissible and balance the load, to rounding; ``upper`` is what they cost, exact
                 forces next to them cost hardly more; the dual function at (y, beta), in closed form, reaches
                 ``lower``; and both are close
     STALLED     the same of each end of the bracket that is finite
@@ -39,7 +39,10 @@ CLOSE = 1e-6  # relative gap that OPTIMAL may leave
 
 
 class Claim(NamedTuple):
-    """What N lanes say, in the problem's units: s (N, k, n), twists (N, m) over L, rates (N, q), the rest (N,)."""
+    """What N lanes say, in the problem's units: s (N, k, n), twists (N, m) over L, rates (N, q), the rest (N,).
+
+    Beside the escape twist, which has any size, the joint rates are those of ``escape_rates``.
+    """
 
     status: np.ndarray
     s: np.ndarray
@@ -48,6 +51,7 @@ class Claim(NamedTuple):
     load_twist: np.ndarray
     escape_twist: np.ndarray
     joint_rates: np.ndarray
+    escape_rates: np.ndarray
 
 
 class Shown(NamedTuple):
@@ -74,7 +78,7 @@ def prove_forces(grasp, answer, problem, tolerance: float | None = None) -> Proo
         lost = asked.valid & (claim.status == INFEASIBLE) & (claim.lower == np.inf) & (claim.upper == np.inf)
         lost &= (claim.s == 0).all((-1, -2))
         out, off = prove_separation(
-            asked, posed.wrench, claim.escape_twist, claim.joint_rates, NEARBY * eps, lost
+            asked, posed.wrench, claim.escape_twist, claim.escape_rates, NEARBY * eps, lost
         )
         level, distance = np.where(lost, out, level), np.where(lost, off, shown.distance)
         nothing = np.isnan(claim.lower) & np.isnan(claim.upper)
@@ -105,6 +109,7 @@ def _claim(posed: ForceProblem, answer) -> Claim:
         scaled_twist(said.numbers("load_twist", m), length, asked.dimension) / back,
         scaled_twist(said.numbers("escape_twist", m), length, asked.dimension),
         said.numbers("joint_rates", q) / back,
+        said.numbers("joint_rates", q),
     )
 
 

@@ -81,7 +81,7 @@ def _power(grasp: ExactGrasp, twist: Twist, wrench: np.ndarray) -> Fraction:
     """The work of the load along the twist, up to a positive factor."""
     d = grasp.dimension
     unit = Fraction(2) ** grasp.length_exponent
-    parts, exponent = integers(wrench)
+    parts = integers(wrench)[0]
     rows = [*twist.velocity, *twist.rotation]
     full = [*rows[:d], *(rows[3:] if d == 3 else rows[5:])]
     force = sum(f * v for f, v in zip(parts[:d], full[:d], strict=True))

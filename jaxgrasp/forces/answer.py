@@ -197,14 +197,15 @@ def _rounding(program: ConvexConeProgram, rows: Array, u: Cone, size: Array) -> 
 
 @stage
 def _stored(folded: Folded, program: ConvexConeProgram, found: Multipliers, u: Cone, load: Load) -> Array:
-    """What it can lose when it is evaluated again from the twist of A, with all rounding allowed for."""
+    """What it can lose when it is evaluated again from the twist of A, in float64 and with all rounding allowed for."""
     m, joints = program.rhs.shape[0], found.rows.shape[0] - program.rhs.shape[0]
     forces, speed = jnp.sqrt(cone_sum(program.exists * inner(u, u))), vector_norm(found.twist)
     blur = folded.norm * speed * forces * load.size + speed * vector_norm(load.wrench)
     if joints:
         square = [cone_sum(inner(*[tuple(c[j] for c in program.columns)] * 2)) for j in range(m, m + joints)]
         blur = blur + vector_norm(found.rows[m:]) * jnp.sqrt(reduce(jnp.add, square)) * forces * load.size
-    blur = jnp.asarray((32 + len(u) + joints) * unit_roundoff(blur.dtype), blur.dtype) * blur
+    terms = 32 + len(u) + joints if blur.dtype == jnp.float64 else 8
+    blur = jnp.asarray(terms * unit_roundoff(blur.dtype), blur.dtype) * blur
     return blur * load.size if program.curvature is not None else blur
 
 
