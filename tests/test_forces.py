@@ -320,13 +320,17 @@ def test_loads_that_over_or_underflow_are_invalid_or_solved(dtype):
     """The pinch of a disc squeezed by w / (2 mu) a finger, for loads w whose squares are numbers."""
     limit = 2.0**510 if dtype == "float64" else 2.0**62
     tiny, huge = (1e-310, 1e308) if dtype == "float64" else (1e-40, 3e38)
-    grasp = jg.Grasp(np.array([[-1, 0], [1, 0]], dtype), np.array([[1, 0], [-1, 0]], dtype), jg.HardFinger(0.5))
+    grasp = jg.Grasp(
+        np.array([[-1, 0], [1, 0]], dtype), np.array([[1, 0], [-1, 0]], dtype), jg.HardFinger(0.5)
+    )
     loads = np.array([tiny, 1 / limit / 4, 2 / limit, 10.0, limit / 2, 4 * limit, huge, 0.0], dtype)
     wrench = np.stack([0 * loads, -loads, 0 * loads], -1)
     found = jg.optimize_forces(grasp, wrench)
     invalid, optimal = [jg.Status.INVALID] * 2, [jg.Status.OPTIMAL]
     assert list(found.status) == invalid + 3 * optimal + invalid + optimal
-    np.testing.assert_allclose(np.asarray(found.cost)[2:5] / loads[2:5], 1.0, rtol=1e-7 if dtype == "float64" else 1e-4)
+    np.testing.assert_allclose(
+        np.asarray(found.cost)[2:5] / loads[2:5], 1.0, rtol=1e-7 if dtype == "float64" else 1e-4
+    )
     assert found.cost[7] == 0
 
 
@@ -341,7 +345,9 @@ def test_float32_stops_where_nothing_improves():
     iterations = np.asarray(found.iterations)
     assert (np.asarray(found.status) == jg.Status.OPTIMAL).sum() > 100
     assert iterations.mean() < 15 and np.mean(iterations >= 60) < 0.02
-    exact = jg.optimize_forces(jax.tree.map(lambda x: x.astype(np.float64) if x.dtype != bool else x, grasp), load)
+    exact = jg.optimize_forces(
+        jax.tree.map(lambda x: x.astype(np.float64) if x.dtype != bool else x, grasp), load
+    )
     both = (np.asarray(found.status) == jg.Status.OPTIMAL) & (np.asarray(exact.status) == jg.Status.OPTIMAL)
     assert (np.asarray(found.lower, np.float64) <= np.asarray(exact.upper))[both].all()
     assert jg.check(grasp, found, wrench=load, criterion=jg.Gentlest()).all()
