@@ -12,6 +12,7 @@ Float32 lanes are the float64 ones, rounded; their brackets are compared with th
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import sys
 import time
@@ -25,12 +26,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "tables")
 import jax
 import numpy as np
 from figures import write_figures
-from grasps import KINDS, random_coefficients, random_contacts
 
 jax.config.update("jax_enable_x64", True)
 
 import jaxgrasp as jg  # noqa: E402
 
+grasps: Any = importlib.import_module("grasps")
+KINDS, random_contacts, random_coefficients = grasps.KINDS, grasps.random_contacts, grasps.random_coefficients
 MORE = ("near duplicate", "no friction", "little friction", "near critical")
 SHAPES = (2, 4, 8, 16)  # contacts, padding included: the active ones are 1 to 16
 EARNEST = 1e-6  # margins nearer to 0 may stay undecided
@@ -89,7 +91,8 @@ def _of_kind(rng, kind: str, count: int, k: int, dimension: int) -> tuple[np.nda
         position, normal, kinds = random_contacts(rng, 12 * count, k, dimension)
         here = kinds == KINDS.index(kind)
         found.append((position[here], normal[here]))
-    return tuple(np.concatenate(x)[:count] for x in zip(*found, strict=True))
+    position, normal = (np.concatenate(x)[:count] for x in zip(*found, strict=True))
+    return position, normal
 
 
 def _near_critical(rng, model: Model, position, normal, friction, torsion, active) -> np.ndarray:

@@ -64,9 +64,12 @@ def near_critical(dtype):
 def test_verdicts_next_to_critical_friction(dtype):
     grasp, off = near_critical(dtype)
     found = jg.wrench_resistance(grasp)
-    # The numbers in float32 are off by 1e-7, which the float64 verdicts of the same numbers know.
     expected = np.where(off > 0, Status.RESISTANT, Status.NOT_RESISTANT)
-    np.testing.assert_array_equal(found.status, expected)
+    # Below the resolution of the dtype, about 2e-5 in float32, a bracket around 0 is an answer, too.
+    close = (np.abs(off) < (1e-9 if dtype == "float64" else 2e-5)) & (
+        np.asarray(found.status) == Status.MARGINAL
+    )
+    np.testing.assert_array_equal(np.where(close, expected, found.status), expected)
     n = np.asarray(grasp.normal, np.float64)
     ratio = np.asarray(grasp.model.friction_coefficient, np.float64)[:, 0] * np.abs(n[:, 0, 0] / n[:, 0, 1])
     # Along the line the tangential part is tan(angle) times the normal one: t* = 1 - tan(angle) / mu.
@@ -102,38 +105,33 @@ def solve(M, rhs):
     return [row[-1] for row in rows]
 
 
-def planar_truth(grasp, found, i):
-    """Squares of slack and lengths for lane i in the plane: the exact internal force next to the stored one.
-
-    Forces in directions n and t that are not of unit length: N = |n|, so that no root is needed; f = a n + b t counts
-    a N as its normal and b N as its tangential part, both over N here.
-    """
+def exact_force(grasp, found, i):
+    """The exact internal force (n_1, t_1, n_2, t_2) next to the stored one, for unit normals in rationals."""
     p = [[exact(x) for x in row] for row in np.asarray(grasp.position)[i]]
-    n = [[exact(x) for x in row] for row in np.asarray(grasp.normal)[i]]
+    n = [(Fraction(3, 5), Fraction(4, 5)), (Fraction(-3, 5), Fraction(4, 5))]
     mu = [exact(x) for x in np.asarray(grasp.model.friction_coefficient)[i]]
     force = np.asarray(found.internal_force)[i].reshape(len(p), 2)
     columns, s = [], []
     for q, d, m, f in zip(p, n, mu, force, strict=True):
-        for direction, factor, part in (((d[0], d[1]), 1, f[1]), ((d[1], -d[0]), m, f[0])):
+        for direction, factor, part in ((d, 1, f[1]), ((d[1], -d[0]), m, f[0])):
             x, y = (factor * v for v in direction)
             columns.append([x, y, q[0] * y - q[1] * x])
             s.append(exact(part) / factor)
     gram = [[sum(c[a] * c[b] for c in columns) for b in range(3)] for a in range(3)]
-    residual = [sum(c[a] * v for c, v in zip(columns, s, strict=True)) for a in range(3)]
-    y = solve(gram, residual)
-    s = [v - sum(c[a] * y[a] for a in range(3)) for c, v in zip(columns, s, strict=True)]
-    return s
+    y = solve(gram, [sum(c[a] * v for c, v in zip(columns, s, strict=True)) for a in range(3)])
+    return [v - sum(c[a] * y[a] for a in range(3)) for c, v in zip(columns, s, strict=True)]
 
 
 def test_resistant_is_true_of_the_stored_numbers():
     """Normals of unit length in rationals (3/5, 4/5), mu next to the critical 4/3: the slack's sign is exact."""
     off = np.array([1e-4, 1e-6, 1e-8, 1e-10])
     position = np.broadcast_to([[-1.0, 0], [1, 0]], (4, 2, 2))
-    normal = np.broadcast_to([[3.0, 4.0], [-3.0, 4.0]], (4, 2, 2))
+    length = 2.0 ** np.array([[0, 1], [-1000, 1000], [900, 0], [3, -900]])  # of normals: any will do
+    normal = np.array([[3.0, 4.0], [-3.0, 4.0]]) * length[..., None]
     grasp = jg.Grasp(position, normal, jg.HardFinger((4 / 3 * (1 + off))[:, None] * np.ones((4, 2))))
     found = jg.wrench_resistance(grasp)
     for i in range(4):
-        s = planar_truth(grasp, found, i)
+        s = exact_force(grasp, found, i)
         mean = (s[0] + s[2]) / 2
         slack = min(s[0] - abs(s[1]), s[2] - abs(s[3])) / mean
         assert Fraction(float(found.lower[i])) <= slack <= Fraction(float(found.upper[i]))

@@ -40,7 +40,7 @@ from .pairs import Pair, pair, pair_roundoff, pair_sqrt, pair_sum, pair_where
 from .products import matvec, rmatvec, vector_inner, vector_norm
 from .reduced_kkt import KKTVector, kkt_solve
 from .regularity import regular
-from .singular_values import row_svd
+from .singular_values import RowSVD, row_svd
 from .small_matrices import eigenvalues, left_svd, null_basis, pseudo_inverse, singular_values, solve
 
 __all__ = [
@@ -58,6 +58,7 @@ __all__ = [
     "LinearStep",
     "Pair",
     "PointShift",
+    "RowSVD",
     "advance_linear_cone_program",
     "begin_convex_cone_program",
     "begin_linear_cone_program",

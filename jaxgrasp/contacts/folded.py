@@ -51,14 +51,7 @@ def _coordinates(points: Array) -> tuple[Array, ...]:
     return tuple(points[:, i] for i in range(points.shape[1]))
 
 
-@stage
-def _valid_and_live(
-    position: Array, normal: Array, friction: Array, torsion: Array, active: Array
-) -> tuple[Array, Array]:
-    """Which lanes are grasps (L,), and which of their contacts count (k, L)."""
-    coordinates = _coordinates(position), _coordinates(normal)
-    valid = sound(*coordinates, friction, torsion, active, cone_max)
-    return valid, active & valid
+_largest = stage(cone_max)  # what it is the largest of is stored, not computed again for each contact
 
 
 @stage
@@ -102,7 +95,8 @@ def fold(contacts: Contacts, components: tuple[Component, ...], length: Array | 
     """
     position, normal, friction, torsion, active = (to_lanes(x) for x in contacts)
     dtype, dimension = position.dtype, position.shape[1]
-    valid, live = _valid_and_live(position, normal, friction, torsion, active)
+    valid = sound(_coordinates(position), _coordinates(normal), friction, torsion, active, _largest)
+    live = active & valid
     exists = live.astype(dtype)
     point = jnp.where(live[:, None], position, jnp.zeros_like(position))
     length = _length(point) if length is None else length

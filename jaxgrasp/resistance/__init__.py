@@ -2,9 +2,10 @@
 
 from .derivatives import Scales, Solved, differentiable
 from .problem import margin_program, starting_point, upper_bound
+from .rank import Rank
 from .solve import TOTAL_BUDGET, WrenchResistance, wrench_resistance
 from .trace import Trace, trace
-from .verdict import Rank, Verdict, judge
+from .verdict import Verdict, judge
 
 __all__ = [
     "Rank",

@@ -15,7 +15,7 @@ Source: Benson, Ye, Zhang, Solving large-scale sparse semidefinite programs for 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -68,10 +68,13 @@ def _fold(
     )
     lengths = 1.0 / pair(length)
     point = pair(point) * lengths
-    rows = pair(raw * jnp.exp2(-jnp.floor(jnp.log2(jnp.max(jnp.abs(raw), axis=0)))))  # times a power of two
+    half = 2.0 ** (jnp.finfo(raw.dtype).maxexp // 2)  # exact, so that no reciprocal underflows
+    raw = jnp.where(jnp.max(jnp.abs(raw), axis=0) > 1, raw / half, raw * half)
+    rows = pair(raw) / jnp.max(jnp.abs(raw), axis=0)
     unit = rows / pair_sqrt(pair_sum(rows * rows, 0))
     sign = jnp.where(raw[-1] >= 0, 1.0, -1.0).astype(raw.dtype)
-    frames = frame_components(tuple(unit[i] for i in range(dimension)), sign)
+    coordinates: Any = tuple(unit[i] for i in range(dimension))
+    frames: Any = frame_components(coordinates, sign)  # the same formula, of pairs
     exists, mu, gamma = (jnp.where(live, x, 0) for x in (jnp.ones_like(friction), friction, torsion))
     directions, scale = [], []
     for component in normal_first(components):
@@ -155,9 +158,11 @@ def _transposed(A: Pair, y: Pair) -> Pair:
 
 def _mirrored(x: Pair, axis: int = 0) -> Pair:
     """(x_0, -x_1, ..) along an axis."""
-    sign = np.ones(x.hi.shape[axis], x.hi.dtype)
-    sign[1:] = -1
-    sign = sign.reshape(-1, *(1,) * (x.hi.ndim - 1 - axis))
+    sign = (
+        jnp.where(jnp.arange(x.hi.shape[axis]) > 0, -1.0, 1.0)
+        .astype(x.hi.dtype)
+        .reshape(-1, *(1,) * (x.hi.ndim - 1 - axis))
+    )
     return Pair(sign * x.hi, sign * x.lo)
 
 

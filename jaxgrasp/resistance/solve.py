@@ -22,7 +22,6 @@ from ..backend import (
     in_chunks,
     in_sweeps,
     is_traced,
-    kernel,
     map_selected,
     tile_width,
     to_lanes,
@@ -34,12 +33,6 @@ from ..conic import (
     LinearPoint,
     LinearState,
     begin_linear_cone_program,
-    cone_max,
-    cone_min,
-    cone_sum,
-    inner,
-    rmatvec,
-    row_svd,
     solve_linear_cone_program,
     vector_norm,
 )
@@ -52,16 +45,15 @@ from ..core import (
     Status,
     bracket_width,
     gap_goal,
-    perturbation_tolerance,
-    rank_tolerance,
     rounding_constant,
     unit_roundoff,
     wrench_dimension,
 )
 from .derivatives import Scales, Solved, differentiable
 from .problem import Start, margin_program, starting_point
+from .rank import Rank, rank_kernel, unnoticed
 from .second_attempt import second_attempt
-from .verdict import Rank, Verdict, judge, unnoticed
+from .verdict import Verdict, judge
 
 __all__ = ["WrenchResistance", "wrench_resistance"]
 
@@ -251,44 +243,11 @@ def _advance(
     return _progress(plan, lanes, state, tolerance)
 
 
-def _certain_contacts(contacts: Contacts, length: Array) -> Contacts:
-    """Coefficients 1 and L in place of mu and gamma, and 0 where rounding could make them 0.
-
-    A twist that these contacts do not notice, rounded numbers of the grasp do not notice either: mu x_t = 0 for mu > 0
-    means x_t = 0. However little friction there is, their singular values are those of the geometry.
-    """
-    limit, L = 2 * perturbation_tolerance(length.dtype), length[:, None]
-    one, zero = jnp.ones_like(contacts.friction), jnp.zeros_like(contacts.friction)
-    return contacts._replace(
-        friction=jnp.where(contacts.friction > limit, one, zero),
-        torsion=jnp.where(contacts.torsion > limit * L, L, zero),
-    )
-
-
-def _rank_kernel(plan: _Plan) -> Callable[[Contacts], Rank]:
-    @kernel
-    def run(contacts: Contacts) -> Rank:
-        folded = fold(contacts, plan.components)
-        certain = fold(_certain_contacts(contacts, folded.length), plan.components, folded.length)
-        both = (jnp.concatenate(x.columns, axis=1) for x in (folded, certain))
-        svd, width = row_svd(jnp.concatenate(tuple(both), axis=-1)), plan.width
-        values = svd.values[:, :width]
-        counts = values > rank_tolerance(values.dtype) * cone_max(values)
-        smallest = cone_min(jnp.where(counts, values, jnp.full_like(values, jnp.inf)))
-        _, null = svd.smallest()
-        null = null[:, width:]
-        x = rmatvec(certain.columns, null)
-        noticed = cone_max(certain.exists * jnp.sqrt(inner(x, x)))
-        return Rank(cone_sum(counts.astype(values.dtype)), smallest, to_rows(null), noticed)
-
-    return run
-
-
 def _solve_rows(plan: _Plan, contacts: Contacts, count: Array, tolerance: Array) -> Solved:
     """All sweeps over the first ``count`` of (N, ..) rows; N is a multiple of the tile width."""
     n, m, dtype = contacts.position.shape[0], wrench_dimension(plan.dimension), contacts.position.dtype
     unknown = Rank(jnp.full(n, -1, dtype), jnp.zeros(n, dtype), jnp.zeros((n, m), dtype), jnp.ones(n, dtype))
-    rank_of = _rank_kernel(plan)
+    rank_of = rank_kernel(plan.components)
 
     def step(contacts: Contacts, ranks: Rank, progress: _Progress, sweep: Array) -> _Progress:
         return _advance(plan, contacts, ranks, progress.state, sweep, tolerance)

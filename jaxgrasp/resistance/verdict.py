@@ -14,28 +14,11 @@ import jax.numpy as jnp
 from ..backend import stage
 from ..conic import Cone, cone_min, cone_sum, entries, inner, interior_distance, matvec, rmatvec, vector_norm
 from ..contacts import Folded, Tile, normalized, onto_null_space, smallest_slack, to_body, to_twist, unfold
-from ..core import Array, Status, first_of, perturbation_tolerance, rounding_constant, unit_roundoff
+from ..core import Array, Status, first_of, rounding_constant, unit_roundoff
 from .problem import bound_of, upper_bound
+from .rank import Rank, unnoticed
 
-__all__ = ["Rank", "Verdict", "judge", "unnoticed"]
-
-
-class Rank(NamedTuple):
-    """Rank of A by its singular values: how many count (L,), the smallest of those (L,).
-
-    null_twist  (m, L) the unit twist that the contacts notice least
-    noticed     (L,) how much the one that notices it most does, in numbers of the grasp (``unnoticed``)
-    """
-
-    count: Array
-    smallest: Array
-    null_twist: Array
-    noticed: Array
-
-
-def unnoticed(rank: Rank) -> Array:
-    """Whether some numbers within rounding of the grasp's do not notice the null twist at all."""
-    return rank.noticed <= perturbation_tolerance(rank.noticed.dtype)
+__all__ = ["Verdict", "judge"]
 
 
 class Verdict(NamedTuple):
