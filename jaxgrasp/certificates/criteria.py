@@ -46,6 +46,10 @@ class Asked(NamedTuple):
         order = [index, *(j for j in range(n) if j != index)]
         return (self.jacobian * self.known.scale[..., None])[:, :, order]
 
+    def joint_work(self, rates: np.ndarray) -> np.ndarray:
+        """``sum_j |beta_j| tau_j`` (N,): infinite where a joint without a limit moves, nothing where it does not."""
+        return np.sum(np.where(rates == 0, 0.0, np.abs(rates) * self.torque), -1)
+
 
 class Multipliers(NamedTuple):
     """A twist y (N, m), joint rates beta (N, q), and x_i = A_i^T y + J_i beta (N, k, n), normal first."""
@@ -138,7 +142,7 @@ def lower_bound(asked: Asked, multipliers: Multipliers, s: np.ndarray) -> np.nda
     """What no admissible forces can undercut; s (N, k, n) near the optimum makes it close."""
     known, name, cap = asked.known, asked.name, asked.cap
     live, (y, rates, x) = known.live, multipliers
-    gain = np.sum(y * asked.load, -1) - np.sum(np.abs(rates) * asked.torque, -1)
+    gain = np.sum(y * asked.load, -1) - asked.joint_work(rates)
     tail = np.linalg.norm(x[..., 1:], axis=-1)
     rho = np.where(live, tail - x[..., 0], 0.0)
     if name in ("SmallestSum", "Gentlest"):

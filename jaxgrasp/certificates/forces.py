@@ -103,7 +103,7 @@ def _asked(grasp, result) -> Asked:
     if result.torque_limits is not None:
         jacobian = rows(result.torque_limits[0], k, n, np.shape(result.torque_limits[0])[-1])
         torque = rows(result.torque_limits[1], jacobian.shape[-1])
-        valid &= np.isfinite(torque).all(-1) & (torque > 0).all(-1)
+        valid &= (torque > 0).all(-1)  # infinite: no limit; NaN compares false
         valid &= (np.isfinite(jacobian).all((-1, -2)) | ~live).all(-1)
         jacobian = np.where(live[..., None, None], jacobian, 0.0)
     return Asked(
@@ -162,7 +162,7 @@ def _optimal(asked: Asked, told: Told, fine: float, tolerance: float, smoothing:
     best = np.where((total == 0) & (sizes.load == 0) & (asked.weight is None), 0.0, best)
     # What evaluating a bound from large multipliers can lose to rounding.
     power = np.linalg.norm(multipliers.y, axis=-1) * (sizes.load + sizes.A * total)
-    power = power + np.sum(np.abs(told.joint_rates) * (asked.torque + sizes.reach), -1)
+    power = power + asked.joint_work(told.joint_rates) + np.sum(np.abs(told.joint_rates) * sizes.reach, -1)
     relative = np.maximum(scale, np.abs(value))
     room = fine * relative
     allowed = tolerance * relative + room
@@ -202,5 +202,5 @@ def _infeasible(asked: Asked, told: Told) -> np.ndarray:
     violation = np.linalg.norm(x[..., 1:], axis=-1) - x[..., 0] + ROUNDING * EPS * blur
     most = np.minimum(asked.cap, LIMIT * size[:, None])
     taken = np.sum(np.where(known.live, np.maximum(violation, 0.0) * most, 0.0), -1)
-    taken = taken + np.abs(rates * asked.torque).sum(-1)
+    taken = taken + asked.joint_work(rates)
     return np.sum(xi * asked.load, -1) - ROUNDING * EPS * speed * size > taken

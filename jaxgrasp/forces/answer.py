@@ -103,7 +103,10 @@ def _violation(program: ConvexConeProgram, u: Cone) -> Array:
         worst = jnp.maximum(worst, cone_max(over))
     if program.bound is not None:
         _, product = program.products(u)
-        worst = jnp.maximum(worst, cone_max(jnp.abs(product) - program.bound))
+        rows = [c[program.rhs.shape[0] :] for c in program.columns]
+        length = jnp.sqrt(sum(jnp.sum(c * c, axis=1) for c in rows))
+        over = (jnp.abs(product) - program.bound) / jnp.where(length > 0, length, jnp.ones_like(length))
+        worst = jnp.maximum(worst, cone_max(over))
     return jnp.maximum(worst, jnp.zeros_like(worst)) / jnp.where(largest > 0, largest, jnp.ones_like(largest))
 
 
