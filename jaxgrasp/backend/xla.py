@@ -65,7 +65,7 @@ def _called(function: Callable, attributes: dict[str, str]) -> Callable:
 
     @functools.wraps(function)
     def wrapper(*args: Any) -> Any:
-        if _INLINED.get():
+        if _INLINED.get() or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
             return function(*args)
         if jax.default_backend() != "cpu" or not _attributes_known():
             # Fusions that compute a value twice round it twice, and a step that was checked is then not the step taken.
