@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from ..contacts import Grasp, TorqueLimits, grasp_map, is_grasp, length_scale, null_space
+from ..contacts import Grasp, TorqueLimits, cleared, grasp_map, is_grasp, length_scale, null_space
 from ..core import (
     Answer,
     Array,
@@ -207,7 +207,7 @@ def _reduce(grasp: Grasp, limit, torques, wrench: Array) -> _Reduced:
     load = wrench * per_length
     size = jnp.linalg.norm(load)
     size = jnp.where(size > 0, size, 1.0)
-    scaling = jnp.where(grasp.active[:, None], grasp.model.scaling(grasp.dimension), 0.0)
+    scaling = jnp.where(grasp.active[:, None], cleared(grasp).model.scaling(grasp.dimension), 0.0)
     exists = scaling.reshape(-1) != 0  # components with coefficient 0 stay exactly 0
     G = jnp.where(exists, grasp_map(grasp), 0.0) * per_length[:, None]
     left, values, right = jnp.linalg.svd(G, full_matrices=False)
@@ -298,7 +298,7 @@ def _level_problem(
 
     log_det, offset = None, jnp.zeros_like(size)
     if criterion.barrier_weight is not None:
-        on_normal, on_cone, _ = grasp.model.log_det_terms(grasp.dimension)
+        on_normal, on_cone, _ = cleared(grasp).model.log_det_terms(grasp.dimension)
         counted = _counted(on_cone, len(constant))
         log_det = LogDetTerm(
             criterion.barrier_weight / size,

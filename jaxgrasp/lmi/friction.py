@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..contacts import Grasp, is_grasp, null_space
+from ..contacts import Grasp, cleared, is_grasp, null_space
 from ..core import Array, Bool, Float, rank_tolerance
 from .barrier import lmi_minimize
 from .problem import LMIProblem, expect_shape
@@ -61,12 +61,12 @@ def friction_lmi(grasp: Grasp) -> FrictionLMI:
     lambda_min is ``mu (f_n - psi)`` for hard fingers (11.4), ``f_n - psi`` for soft ones (11.35), and ``f_n``
     for frictionless contacts and wherever mu = 0.
     """
-    return _block_diagonal(grasp, grasp.model.lmi_matrices(grasp.dimension))
+    return _block_diagonal(grasp, cleared(grasp).model.lmi_matrices(grasp.dimension))
 
 
 def _normalised_friction_lmi(grasp: Grasp) -> FrictionLMI:
     """The friction LMI with ``lambda_min = f_n - psi`` in every block: hard blocks divided by mu."""
-    blocks = grasp.model.lmi_matrices(grasp.dimension)
+    blocks = cleared(grasp).model.lmi_matrices(grasp.dimension)
     diagonal = blocks[
         ..., grasp.model.normal_index(grasp.dimension), 0, 0
     ]  # S_n = diagonal * I in every model

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
 
-from ..contacts import Grasp, grasp_map, nearest_admissible
+from ..contacts import Grasp, cleared, grasp_map, nearest_admissible
 from ..core import Array, Bool, Float, Int, Status, applied
 from .computed_torque import Command, ContactController, Reference, tracking_error
 from .linearization import Scaled, is_equilibrium, linearize, scaled_system
@@ -121,7 +121,7 @@ def _design(grasp: Grasp, system: Scaled, timestep: Array, weight: float) -> tup
     X = riccati(A, B, unit, weight)
     costate = X @ jnp.linalg.solve(unit + B @ jnp.swapaxes(B, -1, -2) @ X / weight, A)
     scaled = jnp.swapaxes(B, -1, -2) @ costate / weight
-    scaling = jnp.where(grasp.active[..., None], grasp.model.scaling(d), 0.0)
+    scaling = jnp.where(grasp.active[..., None], cleared(grasp).model.scaling(d), 0.0)
     scaling = scaling.reshape(*scaling.shape[:-2], -1)
     one = jnp.ones_like(system.length)
     units = jnp.stack([1 / system.length] * d + [one] * (states // 2 - d), axis=-1)

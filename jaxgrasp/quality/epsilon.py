@@ -24,7 +24,7 @@ from jax.typing import ArrayLike
 
 from ..backend import batched, in_chunks, is_traced, map_tiles
 from ..certificates import prove_epsilon, proved_by
-from ..contacts import Grasp
+from ..contacts import Grasp, cleared
 from ..core import Answer, Array, Bool, Float, Int, Status
 from ..resistance import WrenchResistance, wrench_resistance
 from .polytope import Capacity, Polytope, begin, grow, widen
@@ -213,7 +213,7 @@ def _to_components(grasp: Grasp, s: Array) -> Array:
     index = grasp.model.normal_index(grasp.dimension)
     n = s.shape[-1]
     order = [*range(1, index + 1), 0, *range(index + 1, n)]
-    scale = grasp.model.scaling(grasp.dimension)
+    scale = cleared(grasp).model.scaling(grasp.dimension)
     extra = s.ndim - scale.ndim
     scale = jnp.expand_dims(scale, tuple(range(scale.ndim - 2, scale.ndim - 2 + extra)))
     f = s[..., jnp.array(order)] * scale

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ..contacts import Grasp, length_scale
+from ..contacts import Grasp, cleared, length_scale
 from ..core import Answer, Array, Float, Int, Status, normalize, safe_root
 from ..resistance import wrench_resistance
 from .unit_wrench_space import effort_map, scaled
@@ -108,7 +108,7 @@ def _resistant_slack(data: _Data, resistant: Array, r: Array) -> Array:
     c = _chord(r)
     s = data.force
     mu, gamma = data.friction, data.torsion
-    pull = jnp.sqrt(s[:, 0] ** 2 + (mu * _norm(s[:, 1 : min(n, d)])) ** 2)  # |F_i|
+    pull = safe_root(s[:, 0] ** 2 + (mu * _norm(s[:, 1 : min(n, d)])) ** 2)  # |F_i|
     spin = jnp.abs(gamma * s[:, 3]) if n == 4 else jnp.zeros_like(pull)
     wide = jnp.moveaxis(A, 0, 1).reshape(m, k * n)
     gram = jnp.where(resistant, wide @ wide.T, jnp.eye(m, dtype=A.dtype))  # elsewhere it may be singular
@@ -211,8 +211,9 @@ def _guarantee(grasp: Grasp, status: Array, force: Array, twist: Array, margin: 
     def safe(x: Array, value: float) -> Array:
         return jnp.where(live.reshape(*live.shape, *([1] * (x.ndim - live.ndim))), x, value)
 
-    over = safe(grasp.position / length[..., None, None], 0.0)
-    normal = safe(normalize(grasp.normal), 0.0)
+    harmless = cleared(grasp, live)
+    over = harmless.position / length[..., None, None]
+    normal = safe(normalize(harmless.normal), 0.0)
     s = scaled(grasp, safe(force.reshape(*batch, grasp.contacts, -1), 0.0).reshape(force.shape))
     scaled_twist = jnp.concatenate([twist[..., :d], twist[..., d:] * length[..., None]], axis=-1)
     size = _norm(scaled_twist)[..., None]
@@ -224,8 +225,8 @@ def _guarantee(grasp: Grasp, status: Array, force: Array, twist: Array, margin: 
         jnp.where(known, A, identity),
         over,
         normal,
-        safe(grasp.model.friction_coefficient, 0.0),
-        safe(grasp.model.torsion_coefficient, 0.0) / length[..., None],
+        harmless.model.friction_coefficient,
+        harmless.model.torsion_coefficient / length[..., None],
         live,
         s,
         jnp.where(valid[..., None], scaled_twist, 0.0),

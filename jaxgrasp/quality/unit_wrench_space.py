@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
 
-from ..contacts import Grasp, folded_grasp_map, length_scale
+from ..contacts import Grasp, cleared, folded_grasp_map, length_scale
 from ..core import Array, Bool, Float, safe_root, wrench_dimension
 
 __all__ = [
@@ -66,7 +66,7 @@ def effort_map(grasp: Grasp, length: Float[Array, "*batch"]) -> Float[Array, "*b
 @eqx.filter_jit
 def scaled(grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch k n"]:
     """s with f = (mu, mu, 1, gamma) s, normal component first; 0 where a component does not exist."""
-    scale = grasp.model.scaling(grasp.dimension)
+    scale = cleared(grasp).model.scaling(grasp.dimension)
     s = force.reshape(*force.shape[:-1], *scale.shape[-2:])
     s = jnp.where(scale > 0, s / jnp.where(scale > 0, scale, 1.0), 0.0)
     index = grasp.model.normal_index(grasp.dimension)
