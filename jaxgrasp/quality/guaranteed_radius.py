@@ -129,7 +129,7 @@ def _resistant_slack(data: _Data, resistant: Array, r: Array) -> Array:
     change = jnp.sqrt(jnp.sum(jnp.where(active, change**2, 0.0)))
     smallest = jnp.sqrt(jnp.maximum(jnp.linalg.eigvalsh(gram)[0], 1e-300))
     q = change / smallest
-    own = jnp.sqrt(jnp.sum(inverse**2, axis=(1, 2)))
+    own = safe_root(jnp.sum(inverse**2, axis=(1, 2)))
     second = jnp.sqrt(jnp.asarray(2.0, A.dtype)) * own * total * q / jnp.where(q < 1, 1 - q, 1.0)
     depth = s[:, 0] - _norm(s[:, 1:]) / (1 - r) - loss - second
     depth = jnp.min(jnp.where(active, depth, jnp.inf))
