@@ -18,7 +18,7 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 
 from ..core import Array, placed
-from .xla import kernel
+from .xla import kernel, while_loop
 
 __all__ = [
     "Sweeps",
@@ -93,7 +93,7 @@ def map_tiles(kernel: Callable[[Any], Any], rows: Any, count: Array, width: int)
         return tile + jnp.int32(1), updated
 
     tiles = _tiles(count, width)
-    return lax.while_loop(lambda carry: carry[0] < tiles, one_tile, (jnp.int32(0), out))[1]
+    return while_loop(lambda carry: carry[0] < tiles, one_tile, (jnp.int32(0), out), (rows, count))[1]
 
 
 def _tiles(count: Array, width: int) -> Array:
@@ -124,7 +124,7 @@ def map_selected(kernel: Callable[[Any], Any], selected: Array, rows: Any, out: 
         updated = jax.tree.map(lambda x, r: x.at[chosen].set(r, mode="drop"), current, result)
         return tile_number + jnp.int32(1), updated
 
-    return lax.while_loop(pending, one_tile, (jnp.int32(0), out))[1]
+    return while_loop(pending, one_tile, (jnp.int32(0), out), (rows, selected))[1]
 
 
 class Packing:
@@ -177,7 +177,7 @@ def in_sweeps(sweeps: Sweeps, rows: Any, aside: Any, like: Any, count: Array, wi
     """
     n = _count(rows)
     given, known, made = Packing(rows), Packing(aside), Packing(like)
-    source = given.pack(rows)
+    source, everything = given.pack(rows), (rows, aside, count)
     shapes = jax.eval_shape(made.pack, like)
     out = jax.tree.map(lambda s: jnp.zeros((n, *s.shape[1:]), s.dtype), shapes)
     live = jnp.arange(n, dtype=jnp.int32) < count
@@ -202,11 +202,11 @@ def in_sweeps(sweeps: Sweeps, rows: Any, aside: Any, like: Any, count: Array, wi
             updated = jax.tree.map(lambda x, r: x.at[chosen].set(r, mode="drop"), current, result)
             return tile + jnp.int32(1), updated
 
-        out = lax.while_loop(lambda carry: carry[0] < tiles, one_tile, (jnp.int32(0), out))[1]
+        out = while_loop(lambda carry: carry[0] < tiles, one_tile, (jnp.int32(0), out), everything)[1]
         return number + 1, aside, out
 
     start = (jnp.int32(0), known.pack(aside), out)
-    return made.unpack(lax.while_loop(lambda carry: carry[0] < sweeps.count, sweep, start)[2])
+    return made.unpack(while_loop(lambda carry: carry[0] < sweeps.count, sweep, start, everything)[2])
 
 
 def in_chunks(solve: Callable[[Any, Array], Any], rows: Any, batch: tuple[int, ...], chunk: int) -> Any:

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ..backend import fori_loop, while_loop
 from ..core import Array, Status, gap_goal, rank_tolerance, unit_roundoff
 from .problem import LMIProblem, LMISolution, LogDetTerm, check_shapes, over_batch
 
@@ -169,7 +170,7 @@ def _line_search(slope: Array, bend: Array, eigenvalues: Array, counts: Array) -
         rising = slope + middle * bend - jnp.sum(counts * eigenvalues / (1 + middle * eigenvalues)) > 0
         return jnp.where(rising, low, middle), jnp.where(rising, middle, high)
 
-    low, _ = jax.lax.fori_loop(0, 20, bisect, (jnp.zeros_like(wall), jnp.minimum(wall, 16.0)))
+    low, _ = fori_loop(0, 20, bisect, (jnp.zeros_like(wall), jnp.minimum(wall, 16.0)))
     return low
 
 
@@ -235,7 +236,7 @@ def _minimize(problem: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
         steps=jnp.zeros((), jnp.int32),
         stalled=~(interior & space.held),  # not held: the cost falls for ever
     )
-    end = jax.lax.while_loop(unfinished, advance, start)
+    end = while_loop(unfinished, advance, start)
     status = jnp.where(good(end), Status.OPTIMAL.value, Status.STALLED.value)
     status = jnp.where(jnp.isfinite(end.value), status, Status.INVALID.value).astype(jnp.int32)
     lower = jnp.minimum(end.bound, end.value)

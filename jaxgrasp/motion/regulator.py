@@ -14,9 +14,9 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import lax
 from jax.typing import ArrayLike
 
+from ..backend import fori_loop
 from ..contacts import Grasp, cleared, grasp_map, nearest_admissible
 from ..core import Array, Bool, Float, Int, Status, applied
 from .computed_torque import Command, ContactController, Reference, tracking_error
@@ -45,7 +45,7 @@ def riccati(
         H_next = H + transposed(A) @ H @ solved_A
         return A @ solved_A, (G_next + transposed(G_next)) / 2, (H_next + transposed(H_next)) / 2
 
-    return lax.fori_loop(0, DOUBLINGS, double, (A, B @ transposed(B) / weight, Q))[2]
+    return fori_loop(0, DOUBLINGS, double, (A, B @ transposed(B) / weight, Q))[2]
 
 
 class Regulator(ContactController):
@@ -108,7 +108,7 @@ def _image(system: Scaled, timestep: Array) -> tuple[Array, Array]:
 
 def _settles(A: Array) -> Array:
     """Whether the powers of A vanish."""
-    power, _ = lax.fori_loop(0, 20, lambda _, now: (now[0] @ now[0], now[1]), (A, A))
+    power, _ = fori_loop(0, 20, lambda _, now: (now[0] @ now[0], now[1]), (A, A))
     return jnp.all(jnp.isfinite(power), axis=(-1, -2)) & (jnp.max(jnp.abs(power), axis=(-1, -2)) < 1e-3)
 
 

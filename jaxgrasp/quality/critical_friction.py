@@ -20,7 +20,7 @@ import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
 
-from ..backend import is_traced
+from ..backend import is_traced, while_loop
 from ..contacts import ContactModel, Grasp
 from ..core import Answer, Array, Float, Int, Status, wrench_dimension
 from ..resistance import WrenchResistance, wrench_resistance
@@ -216,7 +216,7 @@ def _grasp(data: _Data, model: ContactModel, active: Array) -> Grasp:
 def _critical(data: _Data, model: ContactModel, active: Array) -> tuple[Array, Array, Array]:
     grasp = _grasp(data, model, active)
     traced = is_traced(grasp)
-    return _factors(*_search(grasp, lax.while_loop if traced else _python_loop))
+    return _factors(*_search(grasp, while_loop if traced else _python_loop))
 
 
 @jax.jit

@@ -25,8 +25,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
+from ..backend import fori_loop
 from ..contacts import Grasp, cleared, length_scale
 from ..core import Answer, Array, Float, Int, Status, normalize, safe_root
 from ..resistance import wrench_resistance
@@ -168,7 +168,7 @@ def _radius(data: _Data, resistant: Array) -> Array:
         return jnp.where(good, middle, low), jnp.where(good, high, middle)
 
     zero = jnp.zeros((), data.A.dtype)
-    low, _ = lax.fori_loop(0, HALVINGS, halve, (zero, zero + LARGEST))
+    low, _ = fori_loop(0, HALVINGS, halve, (zero, zero + LARGEST), (data, resistant))
     return low
 
 
