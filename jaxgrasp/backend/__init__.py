@@ -12,7 +12,7 @@ from .tiles import (
     to_lanes,
     to_rows,
 )
-from .xla import fori_loop, inlined, is_traced, kernel, stage, while_loop
+from .xla import fori_loop, inlined, is_traced, kernel, stage, varying_like, while_loop
 
 __all__ = [
     "Sweeps",
@@ -32,5 +32,6 @@ __all__ = [
     "to_lanes",
     "to_rows",
     "usable_backend",
+    "varying_like",
     "while_loop",
 ]

@@ -31,7 +31,7 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 
-__all__ = ["fori_loop", "inlined", "is_traced", "kernel", "stage", "while_loop"]
+__all__ = ["fori_loop", "inlined", "is_traced", "kernel", "stage", "varying_like", "while_loop"]
 
 SWITCH = "JAXGRASP_KERNELS"
 
@@ -53,33 +53,35 @@ def _varying(x: Any) -> frozenset[str]:
     return frozenset(getattr(kind, "varying", None) or getattr(kind, "vma", None) or ())
 
 
-def _alike(init: Any, like: Any, body: Callable[..., Any]) -> tuple[Any, Callable[..., Any]]:
-    """``init``, and ``body`` whose last argument it is, with all leaves varying along the axes of any of them."""
-    axes = frozenset().union(*(_varying(x) for x in jax.tree.leaves((init, like))))
+def varying_like(tree: Any) -> Callable[[Any], Any]:
+    """What makes all arrays of a tree differ between devices where one of ``tree`` does; elsewhere it changes nothing.
 
-    def cast(tree: Any) -> Any:
-        def varied(x: Any) -> Any:
-            missing = tuple(axes - _varying(x))
-            return lax.pcast(x, missing, to="varying") if missing else x
+    ``jax.shard_map`` checks that a loop's carry, or both ways of a choice, agree in that.
+    """
+    axes = frozenset().union(*(_varying(x) for x in jax.tree.leaves(tree)))
 
-        return jax.tree.map(varied, tree)
+    def cast(x: Any) -> Any:
+        missing = tuple(axes - _varying(x))
+        return lax.pcast(x, missing, to="varying") if missing else x
 
-    return (cast(init), lambda *args: cast(body(*args))) if axes else (init, body)
+    return functools.partial(jax.tree.map, cast)
 
 
-def while_loop(unfinished: Callable[[Any], Any], body: Callable[[Any], Any], init: Any, like: Any = ()) -> Any:
+def while_loop(
+    unfinished: Callable[[Any], Any], body: Callable[[Any], Any], init: Any, like: Any = ()
+) -> Any:
     """``lax.while_loop`` that ``jax.shard_map`` can check: ``init`` may hold constants, the same on every device.
 
     ``like``  what ``body`` reads besides: its results differ between devices where this does
     """
-    init, body = _alike(init, like, body)
-    return lax.while_loop(unfinished, body, init)
+    cast = varying_like((init, like))
+    return lax.while_loop(unfinished, lambda carry: cast(body(carry)), cast(init))
 
 
 def fori_loop(lower: int, upper: int, body: Callable[[Any, Any], Any], init: Any, like: Any = ()) -> Any:
     """``lax.fori_loop``, as ``while_loop``."""
-    init, body = _alike(init, like, body)
-    return lax.fori_loop(lower, upper, body, init)
+    cast = varying_like((init, like))
+    return lax.fori_loop(lower, upper, lambda i, carry: cast(body(i, carry)), cast(init))
 
 
 @contextmanager
@@ -140,7 +142,8 @@ def _kind(args: tuple[Any, ...]) -> Any:
     """What a trace depends on: shapes, types and tree of the arguments, and JAX's rules for types."""
     leaves, tree = jax.tree.flatten(args)
     shapes = tuple(
-        (np.shape(x), jnp.result_type(x), getattr(jax.typeof(x), "weak_type", False), _varying(x)) for x in leaves
+        (np.shape(x), jnp.result_type(x), getattr(jax.typeof(x), "weak_type", False), _varying(x))
+        for x in leaves
     )
     rules = [getattr(jax.config, name) for name in ("jax_enable_x64", "jax_numpy_dtype_promotion")]
     return tree, shapes, jax.sharding.get_abstract_mesh(), *rules

@@ -158,7 +158,9 @@ def _recovered(
     total = rates.sum_on_head()
     if total is not None:
         # Where the rates are small, ``r * s`` has lost nothing, and a price as small would drown in rounding of dz.
-        error = (frame.head_of_unscaled(stored_spectral(q)) - dz[0]) / jnp.maximum(total, jnp.ones_like(total))
+        error = (frame.head_of_unscaled(stored_spectral(q)) - dz[0]) / jnp.maximum(
+            total, jnp.ones_like(total)
+        )
         error = exists * error
         if price.level is not None:
             price = price._replace(level=price.level + error * rates.level)

@@ -22,7 +22,7 @@ import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
 
-from ..backend import batched, in_chunks, is_traced, map_tiles
+from ..backend import batched, in_chunks, is_traced, map_tiles, varying_like
 from ..certificates import prove_epsilon, proved_by
 from ..contacts import Grasp, cleared
 from ..core import Answer, Array, Bool, Float, Int, Status
@@ -173,7 +173,8 @@ def _solve_rows(plan: _Plan, rows: _Rows, count: Array, tolerance: Array) -> _Fo
         none = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)._replace(
             facets=jnp.full(shapes.facets.shape, -1, shapes.facets.dtype)
         )
-        found = lax.cond(resistant, search, lambda: none)
+        cast = varying_like((row, tolerance))
+        found = lax.cond(resistant, lambda: cast(search()), lambda: cast(none))
         return jax.tree.map(lambda x: x[None], found)
 
     return map_tiles(one, rows, count, 1)

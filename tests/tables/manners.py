@@ -6,9 +6,11 @@ by a number, with a third contact that is no contact if asked for.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -71,7 +73,9 @@ def _forces(grasp: jg.Grasp, criterion: Any, **limits: Any) -> Any:
 CASES: dict[str, Case] = {
     "grasp_map": Case(lambda g: _real(jg.grasp_map(g))),
     "grasp_rank": Case(jg.grasp_rank, False),
-    "null_space": Case(lambda g: jnp.abs(_real(contacts.internal_force_part(g, jnp.ones(2 * g.contacts, g.dtype)))), False),
+    "null_space": Case(
+        lambda g: jnp.abs(_real(contacts.internal_force_part(g, jnp.ones(2 * g.contacts, g.dtype)))), False
+    ),
     "contact_frames": Case(lambda g: jg.contact_frames(g)[: len(POSITION)]),
     "force_vectors": Case(lambda g: jg.force_vectors(g, jnp.ones(2 * g.contacts, g.dtype))[: len(POSITION)]),
     "contacts.folded_grasp_map": Case(lambda g: _real(contacts.folded_grasp_map(g))),
@@ -82,7 +86,9 @@ CASES: dict[str, Case] = {
     "optimize_forces": Case(lambda g: _forces(g, jg.Gentlest())),
     "optimize_forces, robust": Case(lambda g: _forces(g, jg.Robust(0.1))),
     "optimize_forces, sum of squares": Case(lambda g: _forces(g, jg.SumOfSquares(), max_normal=np.inf)),
-    "optimize_forces, least norm, limits": Case(lambda g: _forces(g, jg.LeastNorm(), torque_limits=_limits(g))),
+    "optimize_forces, least norm, limits": Case(
+        lambda g: _forces(g, jg.LeastNorm(), torque_limits=_limits(g))
+    ),
     "equilibrium": Case(lambda g: jg.equilibrium(g, LOAD).slack),
     "squeeze": Case(lambda g: jg.squeeze(g, LOAD).effort),
     "resistible_wrenches": Case(lambda g: jg.resistible_wrenches(g, LOADS).cost),
@@ -99,3 +105,43 @@ CASES: dict[str, Case] = {
     "lmi.friction_lmi": Case(lambda g: lmi.friction_lmi(g).S[:6, :6, :6], False),
     "lmi.lmi_forces": Case(lambda g: lmi.lmi_forces(g, LOAD, criterion=jg.SumOfSquares()).upper, False),
 }
+
+# Functions for people, files or long loops, which take known numbers, and what they do instead of being transformed.
+HOST = {
+    "trace": "a log of one grasp for people",
+    "place_contacts": "searches in rounds on the host",
+    "check": "proves in NumPy",
+    "save_grasp": "writes a file",
+    "load_grasp": "reads a file",
+    "close_loop": "simulates; its steps are compiled inside",
+}
+
+
+def row(tree: Any) -> Any:
+    """All numbers of ``tree`` in one row."""
+    return jnp.concatenate([jnp.ravel(jnp.asarray(x)).astype(float) for x in jax.tree.leaves(tree)])
+
+
+def on_two_devices(names: list[str]) -> None:
+    """Print for each case how far its values under ``jax.shard_map`` are from those without; two devices are there."""
+    mesh = jax.sharding.Mesh(np.array(jax.devices()), ("device",))
+    assert mesh.size == 2
+    split = jax.sharding.PartitionSpec("device")
+    for name in names:
+
+        def of(scales: Any, name: str = name) -> Any:
+            return jax.vmap(lambda s: row(CASES[name].of(pinch(s))))(scales)
+
+        scales = jnp.array([1.0, 1.3])
+        plain = np.asarray(jax.jit(of)(scales))
+        mapped = jax.jit(jax.shard_map(of, mesh=mesh, in_specs=split, out_specs=split))
+        sharded = jax.device_put(scales, jax.sharding.NamedSharding(mesh, split))
+        for found in (mapped(scales), jax.jit(of)(sharded)):
+            found = np.asarray(found)
+            worst = np.max(np.abs(found - plain)) if np.all(np.isfinite(found)) else np.inf
+            print(f"{worst:.3e}  {name}", flush=True)
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    on_two_devices(sys.argv[1:])
