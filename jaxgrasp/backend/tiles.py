@@ -65,11 +65,17 @@ def _count(rows: Any) -> int:
 
 
 def padded_rows(rows: Rows, width: int) -> Rows:
-    """``rows`` with zero rows appended up to the next multiple of ``width``, at least one tile."""
+    """``rows`` up to the next multiple of ``width``, at least one tile: the last is repeated, which costs no iteration
+    and is a problem as sound as its own; zeros where there is none."""
     extra = max(1, -(-_count(rows) // width)) * width - _count(rows)
     if not extra:
         return rows
-    return jax.tree.map(lambda x: jnp.concatenate([x, jnp.zeros((extra, *x.shape[1:]), x.dtype)]), rows)
+
+    def pad(x: Array) -> Array:
+        last = x[-1:] if len(x) else jnp.zeros((1, *x.shape[1:]), x.dtype)
+        return jnp.concatenate([x, jnp.broadcast_to(last, (extra, *x.shape[1:]))])
+
+    return jax.tree.map(pad, rows)
 
 
 def map_tiles(kernel: Callable[[Any], Any], rows: Any, count: Array, width: int) -> Any:
@@ -212,7 +218,7 @@ def in_sweeps(sweeps: Sweeps, rows: Any, aside: Any, like: Any, count: Array, wi
 def in_chunks(solve: Callable[[Any, Array], Any], rows: Any, batch: tuple[int, ...], chunk: int) -> Any:
     """``solve(rows, count)`` on chunks of one shape, so that every batch size runs one executable; batch axes restored.
 
-    ``rows`` is a pytree of concrete arrays with the batch axes in front; the last chunk is padded with zeros.
+    ``rows`` is a pytree of concrete arrays with the batch axes in front; the last chunk repeats its last row.
     """
     flat = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[len(batch) :]), rows)
     n = _count(flat)
@@ -224,7 +230,8 @@ def in_chunks(solve: Callable[[Any, Array], Any], rows: Any, batch: tuple[int, .
             piece = x[start : start + count]
             if count == chunk:
                 return piece
-            return np.concatenate([piece, np.zeros((chunk - count, *x.shape[1:]), x.dtype)])
+            last = piece[-1:] if count else np.zeros((1, *x.shape[1:]), x.dtype)
+            return np.concatenate([piece, np.broadcast_to(last, (chunk - count, *x.shape[1:]))])
 
         result = solve(jax.tree.map(part, flat), placed(np.asarray(count, np.int32)))
         results.append(jax.tree.map(lambda x, c=count: np.asarray(x)[:c], result))

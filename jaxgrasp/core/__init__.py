@@ -40,7 +40,7 @@ from .rotations import (
     rotation_between,
     turned,
 )
-from .select import bracket_width, first_of, part_of
+from .select import bracket_width, first_of, nan_where, part_of
 from .status import Status
 from .tolerances import (
     balance_tolerance,
@@ -90,6 +90,7 @@ __all__ = [
     "jacobian_product",
     "jacobian_solve",
     "largest_response",
+    "nan_where",
     "normalize",
     "normalize_components",
     "orientation_matrix",

@@ -25,7 +25,7 @@ from ..conic import (
     vector_norm,
 )
 from ..contacts import to_body, to_twist, unfold
-from ..core import Array, Status, edge_tolerance, first_of, proven_limit, unit_roundoff
+from ..core import Array, Status, edge_tolerance, first_of, nan_where, proven_limit, unit_roundoff
 from .bounds import criterion_value, dual_value
 from .infeasibility import proven_separation
 from .problem import ForceProblem, Load
@@ -213,11 +213,11 @@ def _in_user_units(
         optimal, infeasible = status == Status.OPTIMAL.value, status == Status.INFEASIBLE.value
         invalid, cost, bound = status == Status.INVALID.value, values.cost, values.bound
         m = found.twist.shape[0]
-        nan, inf = jnp.full_like(cost, jnp.nan), jnp.full_like(cost, jnp.inf)
+        inf = jnp.full_like(cost, jnp.inf)
         zero = jnp.zeros_like(cost)
 
         def final(x: Array, none: Array, where: Array) -> Array:
-            return jnp.where(invalid, nan, jnp.where(where, none, x))
+            return nan_where(invalid, jnp.where(where, none, x))
 
         resting = load.rest & optimal & (bound <= zero)
         force = unfold(tuple(load.size * x for x in u), tile.components, *coefficients)

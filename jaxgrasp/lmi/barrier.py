@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from ..backend import fori_loop, while_loop
-from ..core import Array, Status, gap_goal, rank_tolerance, unit_roundoff
+from ..core import Array, Status, gap_goal, nan_where, rank_tolerance, unit_roundoff
 from .problem import LMIProblem, LMISolution, LogDetTerm, check_shapes, over_batch
 
 __all__ = ["lmi_minimize", "minimize"]
@@ -179,7 +179,7 @@ def _square_root(H: Array) -> Array:
     values, vectors = jnp.linalg.eigh(H)
     rounding = len(H) * rank_tolerance(H.dtype) * jnp.max(jnp.abs(values))
     root = jnp.sqrt(jnp.maximum(values, 0.0))[:, None] * vectors.T
-    return jnp.where(values[0] >= -rounding, root, jnp.nan)
+    return nan_where(~(values[0] >= -rounding), root)
 
 
 def minimize(problem: LMIProblem, goal: Array, max_steps: int = MAX_STEPS) -> LMISolution:
@@ -229,7 +229,7 @@ def _minimize(problem: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
         x=problem.start,
         factor=factor,
         term_factor=term_factor,
-        value=jnp.where(interior, value, jnp.nan),
+        value=nan_where(~interior, value),
         weight=jnp.ones((), dtype),
         bound=jnp.full((), -jnp.inf, dtype),
         dual=jnp.zeros_like(problem.constant),

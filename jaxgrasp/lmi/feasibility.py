@@ -19,6 +19,7 @@ from ..core import (
     Status,
     bracket_width,
     gap_goal,
+    nan_where,
     rounding_constant,
     unit_roundoff,
 )
@@ -244,7 +245,7 @@ def sdp_minimize(
     expect_shape(matrices.shape[-3:] == (N, q, q), "matrices", f"(*batch, {N}, {q}, {q})", matrices)
     phase = lmi_feasibility(constant, matrices, tolerance=tolerance)
     feasible = phase.status == Status.FEASIBLE.value
-    start = jnp.where(feasible[..., None], phase.x, jnp.nan)
+    start = nan_where(~feasible[..., None], phase.x)
     end = lmi_minimize(LMIProblem(u, constant, matrices, start), tolerance=tolerance)
     batch = end.batch_shape
     phase = jax.tree.map(lambda x: jnp.broadcast_to(x, (*batch, *x.shape[feasible.ndim :])), phase)

@@ -24,6 +24,7 @@ from ..core import (
     Int,
     Status,
     gap_goal,
+    nan_where,
     rank_tolerance,
     real_array,
     spread,
@@ -191,10 +192,11 @@ def _optimize(grasp: Grasp, criterion: Criterion, limit, torques, wrench: Array,
     status = jnp.where(reduced.rest > goal, Status.INFEASIBLE.value, status)
     status = jnp.where(valid, status, Status.INVALID.value).astype(jnp.int32)
     found = (status == Status.OPTIMAL.value) | (status == Status.STALLED.value)
-    without = jnp.where(status == Status.INFEASIBLE.value, jnp.inf, jnp.nan)
+    without = jnp.where(found, 0.0, jnp.inf)
+    without = nan_where(~found & (status != Status.INFEASIBLE.value), without)
     return LMIForces(
         status=status,
-        force=jnp.where(found, force, jnp.nan),
+        force=nan_where(~found, force),
         upper=jnp.where(found, criterion.cost(grasp, force), without),
         lower=jnp.where(found, scale * end.lower + offset, without),
     )

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ..contacts import Grasp, cleared, is_grasp, null_space
-from ..core import Array, Bool, Float, rank_tolerance
+from ..core import Array, Bool, Float, nan_where, rank_tolerance
 from .barrier import lmi_minimize
 from .problem import LMIProblem, expect_shape
 
@@ -139,4 +139,4 @@ def lmi_margin(grasp: Grasp, *, tolerance: float = 1e-8) -> Float[Array, "*batch
     """
     problem, squeezes = _margin_problem(grasp)
     margin = -lmi_minimize(problem, tolerance=tolerance).upper
-    return jnp.where(is_grasp(grasp), jnp.where(squeezes, margin, -jnp.inf), jnp.nan)
+    return nan_where(~is_grasp(grasp), jnp.where(squeezes, margin, -jnp.inf))

@@ -24,7 +24,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from ..contacts import Grasp
-from ..core import Answer, Array, Float, Int, Status, first_of, rank_tolerance, wrench_dimension
+from ..core import Answer, Array, Float, Int, Status, first_of, nan_where, rank_tolerance, wrench_dimension
 from ..resistance import wrench_resistance
 from .linearization import Linearization, Scaled, first_order, is_equilibrium, linearize, scaled_system
 from .rigid_body import RigidBody
@@ -178,7 +178,7 @@ def _proved(linear: Linearization, resistance: Array, body: RigidBody, system: S
         jnp.where(unknown, -1, rank),
         jnp.where(unknown, -1, reduced_rank),
         jnp.where(unknown, -1, alone),
-        jnp.where(none, jnp.nan, values),
+        nan_where(none, values),
         jnp.where(none, 0.0, motion),
         jnp.where(none, 0.0, weakest),
         jnp.where(full & ~unknown, effort, jnp.inf),

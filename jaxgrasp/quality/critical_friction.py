@@ -22,7 +22,7 @@ from jax.typing import ArrayLike
 
 from ..backend import is_traced, while_loop
 from ..contacts import ContactModel, Grasp
-from ..core import Answer, Array, Float, Int, Status, wrench_dimension
+from ..core import Answer, Array, Float, Int, Status, nan_where, wrench_dimension
 from ..resistance import WrenchResistance, wrench_resistance
 
 __all__ = ["CriticalFriction", "critical_friction", "friction_sweep", "with_friction_factor"]
@@ -182,7 +182,7 @@ def _open(bracket: _Bracket, width: float) -> Array:
 def _ends(end: _Bracket, below: Array, above: Array) -> tuple[Array, Array]:
     """Both ends, from the bracket and the margins at the least and the most friction."""
     always, never = below > 0, ~(above > 0)
-    nan = jnp.where(jnp.isnan(above), jnp.nan, jnp.zeros_like(above))
+    nan = nan_where(jnp.isnan(above), jnp.zeros_like(above))
     lower = jnp.where(always, -jnp.inf, jnp.where(never, jnp.log(MOST), end.low))
     upper = jnp.where(always, jnp.log(LEAST), jnp.where(never, jnp.inf, end.high))
     return lower + nan, upper + nan

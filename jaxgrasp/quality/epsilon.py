@@ -25,7 +25,7 @@ from jax.typing import ArrayLike
 from ..backend import batched, in_chunks, is_traced, map_tiles, varying_like
 from ..certificates import prove_epsilon, proved_by
 from ..contacts import Grasp, cleared
-from ..core import Answer, Array, Bool, Float, Int, Status
+from ..core import Answer, Array, Bool, Float, Int, Status, nan_where
 from ..resistance import WrenchResistance, wrench_resistance
 from .polytope import Capacity, Polytope, begin, grow, widen
 from .unit_wrench_space import NORMS, effort_map, extreme_force, scaled, support, torque_lengths
@@ -277,7 +277,7 @@ def _answer(
     moved = jnp.where(resistant[..., None, None, None], A, lax.stop_gradient(A))
     slope = jnp.einsum("...m,...kmn,...kn->...", direction, moved, found.touching)
     change = slope - lax.stop_gradient(slope)
-    nan = jnp.where(verdict.status == Status.INVALID.value, jnp.nan, 0.0)[..., None]
+    nan = nan_where(verdict.status == Status.INVALID.value, jnp.zeros_like(edge))[..., None]
     return EpsilonQuality(
         verdict.status,
         lower + change,
@@ -305,7 +305,7 @@ def _bound(status: Array, inside: Array, outside: Array) -> Array:
     """``inside`` where RESISTANT, 0 where NOT_RESISTANT, NaN where INVALID, else ``outside``."""
     value = jnp.where(status == Status.NOT_RESISTANT.value, 0.0, outside)
     value = jnp.where(status == Status.RESISTANT.value, inside, value)
-    return jnp.where(status == Status.INVALID.value, jnp.nan, value)
+    return nan_where(status == Status.INVALID.value, value)
 
 
 @functools.partial(jax.jit, static_argnames=("norm",))

@@ -28,7 +28,7 @@ import numpy as np
 
 from ..backend import fori_loop
 from ..contacts import Grasp, cleared, length_scale
-from ..core import Answer, Array, Float, Int, Status, normalize, safe_root
+from ..core import Answer, Array, Float, Int, Status, nan_where, normalize, safe_root
 from ..resistance import wrench_resistance
 from .unit_wrench_space import effort_map, scaled
 
@@ -234,4 +234,4 @@ def _guarantee(grasp: Grasp, status: Array, force: Array, twist: Array, margin: 
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(batch) :]), (data, resistant))
     radius = jax.vmap(_radius)(*flat).reshape(batch)
     radius = jnp.where(resistant | escaping, radius, 0.0)
-    return GuaranteedRadius(status, jnp.where(valid, radius, jnp.nan), length)
+    return GuaranteedRadius(status, nan_where(~valid, radius), length)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ..core import Array, ArrayLike, Float, contact_frame
+from ..core import Array, ArrayLike, Float, contact_frame, nan_where
 
 __all__ = [
     "SmoothSurface",
@@ -226,6 +226,6 @@ def _lanes(surface: SmoothSurface, question: str, shape: str, point: Array) -> A
     def lane(p: Array) -> Any:
         finite = jnp.isfinite(p).all()
         answer = getattr(surface, question)(jnp.where(finite, p, surface.centre + surface.radius))
-        return jax.tree.map(lambda a: jnp.where(finite, a, jnp.full_like(a, jnp.nan)), answer)
+        return jax.tree.map(lambda a: nan_where(~finite, a), answer)
 
     return jnp.vectorize(lane, signature=f"(d)->{shape}")(point)
