@@ -162,7 +162,8 @@ def _optimal(asked: Asked, told: Told, fine: float, tolerance: float, smoothing:
     best = np.where((total == 0) & (sizes.load == 0) & (asked.weight is None), 0.0, best)
     # What evaluating a bound from large multipliers can lose to rounding.
     power = np.linalg.norm(multipliers.y, axis=-1) * (sizes.load + sizes.A * total)
-    power = power + asked.joint_work(told.joint_rates) + np.sum(np.abs(told.joint_rates) * sizes.reach, -1)
+    limits = np.where(np.isfinite(asked.torque), asked.torque, 0.0)
+    power = power + np.sum(np.abs(told.joint_rates) * (limits + sizes.reach), -1)
     relative = np.maximum(scale, np.abs(value))
     room = fine * relative
     allowed = tolerance * relative + room

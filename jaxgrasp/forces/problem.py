@@ -34,6 +34,9 @@ from .criteria import Criterion
 __all__ = ["Demand", "ForceProblem", "Load", "force_problem", "force_program"]
 
 
+FAR = 1e16  # loads: beside such forces the load itself is rounding, so that a larger cap is none
+
+
 class Demand(NamedTuple):
     """What is asked of each grasp, as rows.
 
@@ -127,7 +130,8 @@ def load_of(tile: Tile, demand: Demand) -> tuple[Load, Array]:
 def _scaled_caps(cap: Array, exists: Array, size: Array) -> tuple[Array, Array]:
     """Scaled caps, infinite for none; lanes whose caps are positive numbers."""
     good = (cap > 0) | (exists == 0)  # NaN compares false
-    return jnp.where(good & (exists > 0), cap / size, jnp.full_like(cap, jnp.inf)), cone_all(good)
+    cap = jnp.where(good & (exists > 0), cap / size, jnp.full_like(cap, jnp.inf))
+    return jnp.where(cap < FAR, cap, jnp.full_like(cap, jnp.inf)), cone_all(good)
 
 
 class TorqueRows(NamedTuple):
