@@ -81,7 +81,7 @@ def component_vectors(
 
 def force_vectors(
     grasp: Grasp,
-    force: Float[Array, "*batch kn"],
+    force: Float[ArrayLike, "*batch kn"],
     *,
     axes: Axes = "body",
     orientation: Float[ArrayLike, "*batch o"] | None = None,
@@ -96,6 +96,7 @@ def force_vectors(
     """
     B = component_vectors(grasp, axes=axes, orientation=orientation)
     n = B.shape[-1]
+    force = real_array(force, "force")
     if force.ndim < 1 or force.shape[-1] != grasp.contacts * n:
         raise ValueError(f"force must have shape (*batch, {grasp.contacts * n}), got {force.shape}")
     parts = force.reshape(*force.shape[:-1], grasp.contacts, n)

@@ -316,7 +316,7 @@ def contact_model(
     name: str, friction: Float[ArrayLike, "*batch"], torsion: Float[ArrayLike, "*batch"]
 ) -> ContactModel:
     """The model of this name in ``MODELS`` with mu and gamma (m) per contact; those it does not have are left out."""
-    return MODELS[name]().with_coefficients(jnp.asarray(friction), jnp.asarray(torsion))
+    return MODELS[name]().with_coefficients(real_array(friction, "friction"), real_array(torsion, "torsion"))
 
 
 def model_name(model: ContactModel) -> str:

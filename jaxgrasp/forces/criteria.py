@@ -17,7 +17,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ..contacts import Component, Grasp, cleared
-from ..core import Array, ArrayLike, Float
+from ..core import Array, ArrayLike, Float, real_array
 
 __all__ = ["Criterion", "Gentlest", "LeastNorm", "Robust", "SmallestSum", "SumOfSquares"]
 
@@ -185,9 +185,7 @@ class LeastNorm(Criterion):
 
 
 def _positive(value: ArrayLike, name: str) -> Array:
-    array = jnp.asarray(value)
-    if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
-        raise ValueError(f"{name} must be a positive number, or one per grasp, got {value!r}")
+    array = real_array(value, name, "a positive number, or one per grasp")
     if isinstance(value, int | float) and not value > 0:
         raise ValueError(f"{name} must be positive, got {value}")
-    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.result_type(float))
+    return array

@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from ..contacts import Grasp, TorqueLimits, cleared, folded_grasp_map, length_scale
-from ..core import Answer, Array, Bool, Float, Int, Status, first_of, rank_tolerance, safe_root
+from ..core import Answer, Array, Bool, Float, Int, Status, first_of, rank_tolerance, real_array, safe_root
 from ..resistance import wrench_resistance
 from .criteria import Criterion, Gentlest, Robust, SmallestSum
 from .demand import spread_loads
@@ -243,7 +243,7 @@ def resistible_wrenches(
     ``wrenches`` (T, m) go to every grasp, (*batch, T, m) to their own. Criterion (``Gentlest()`` by default), limits
     and tolerance as for ``optimize_forces``; every answer carries its proof in ``.forces``.
     """
-    array = jnp.asarray(wrenches)
+    array = real_array(wrenches, "wrenches")
     if array.ndim < 2:
         raise ValueError(f"wrenches must have shape (T, m) or (*batch, T, m), got {array.shape}")
     if array.ndim == 2:

@@ -125,7 +125,7 @@ def lmi_forces(
 def _load(grasp: Grasp, wrench) -> Array:
     """(*batch, *loads, m)."""
     batch, m = grasp.batch_shape, wrench_dimension(grasp.dimension)
-    array = jnp.asarray(wrench)
+    array = real_array(wrench, "wrench")
     if array.ndim == 1 and array.shape == (m,):
         return jnp.broadcast_to(array.astype(grasp.dtype), (*batch, m))
     if (

@@ -24,7 +24,18 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from ..contacts import Grasp
-from ..core import Answer, Array, Float, Int, Status, first_of, nan_where, rank_tolerance, wrench_dimension
+from ..core import (
+    Answer,
+    Array,
+    Float,
+    Int,
+    Status,
+    first_of,
+    nan_where,
+    rank_tolerance,
+    real_array,
+    wrench_dimension,
+)
 from ..resistance import wrench_resistance
 from .linearization import Linearization, Scaled, first_order, is_equilibrium, linearize, scaled_system
 from .rigid_body import RigidBody
@@ -113,7 +124,7 @@ def gramian(
     powers = [B]
     for _ in range(3):
         powers.append(A @ powers[-1])
-    horizon = jnp.asarray(horizon, B.dtype)[..., None, None]
+    horizon = real_array(horizon, "horizon").astype(B.dtype)[..., None, None]
     total = jnp.zeros_like(A)
     for i, left in enumerate(powers):
         for j, right in enumerate(powers):

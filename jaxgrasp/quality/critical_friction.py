@@ -22,7 +22,7 @@ from jax.typing import ArrayLike
 
 from ..backend import is_traced, while_loop
 from ..contacts import ContactModel, Grasp
-from ..core import Answer, Array, Float, Int, Status, nan_where, wrench_dimension
+from ..core import Answer, Array, Float, Int, Status, nan_where, real_array, wrench_dimension
 from ..resistance import WrenchResistance, wrench_resistance
 
 __all__ = ["CriticalFriction", "critical_friction", "friction_sweep", "with_friction_factor"]
@@ -62,7 +62,7 @@ class CriticalFriction(Answer):
 
 def with_friction_factor(grasp: Grasp, factor: Float[ArrayLike, "*batch"]) -> Grasp:
     """The grasp with ``factor * mu`` for every mu, gamma unchanged; ``factor`` a number or one a grasp."""
-    return _rougher(grasp, jnp.asarray(factor, grasp.dtype))
+    return _rougher(grasp, real_array(factor, "factor").astype(grasp.dtype))
 
 
 @eqx.filter_jit
@@ -77,7 +77,7 @@ def friction_sweep(
     grasp: Grasp, factors: Float[ArrayLike, " T"], *, verdict_only: bool = False
 ) -> WrenchResistance:
     """The verdicts at each of T factors on all mu, in one call: a ``WrenchResistance`` with batch axes (*batch, T)."""
-    array = jnp.asarray(factors, grasp.dtype)
+    array = real_array(factors, "factors", "a list of numbers").astype(grasp.dtype)
     if array.ndim != 1:
         raise ValueError(f"factors must be a list of numbers, shape (T,), got {array.shape}")
 
