@@ -108,7 +108,7 @@ class TorqueLimits(eqx.Module):
 
     jacobian     (*batch, R, q) maps joint rates to the velocities of the contacts, row for row of the forces in these
                  axes: contact axes R = k n, body and world axes R = k d (soft fingers: 2 k d, velocity then rotation)
-    torque       (q) or (*batch, q), N m, positive
+    torque       (q) or (*batch, q), N m, positive; infinite: no limit
     axes         "contact" (default), "body" or "world"
     orientation  of the body in the world, for world axes, as for ``component_vectors``
 

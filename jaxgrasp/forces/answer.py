@@ -22,6 +22,7 @@ from ..conic import (
     interior_distance,
     matvec,
     rmatvec,
+    tail_norm,
     vector_norm,
 )
 from ..contacts import to_body, to_twist, unfold
@@ -140,6 +141,9 @@ def answer(problem: ForceProblem, state: ConvexState, tolerance: Array) -> Answe
     m, dtype = program.rhs.shape[0], problem.tile.folded.norm.dtype
     u = _polished(projection.basis.columns, program.rhs, program.exists, state.point.u)
     rows, ray = _all_rows(state.point), _to_size_one(state.ray)
+    linear = program.curvature is None and program.cone_floor is None
+    if program.cap is not None and linear and program.smoothing is None:
+        rows = _affordable(program, rows, u)
     values = _values(problem, state.point, u, rows)
 
     found = Multipliers(rows, ray, to_twist(projection, rows[:m]), to_twist(projection, ray[:m]))
@@ -182,6 +186,18 @@ def _to_size_one(ray: Array) -> Array:
     """A proof may be scaled by any positive number; the solver's grows, and may overflow, as long as it is sought."""
     largest = cone_max(jnp.abs(ray))
     return ray / jnp.where((largest > 0) & jnp.isfinite(largest), largest, jnp.ones_like(largest))
+
+
+@stage
+def _affordable(program: ConvexConeProgram, rows: Array, u: Cone) -> Array:
+    """``rows`` scaled down until contacts far below their caps need none: rounding there would cost the whole cap."""
+    x = rmatvec(program.columns, rows)
+    violation = program.exists * jnp.maximum(tail_norm(x) - x[0], jnp.zeros_like(x[0]))
+    far = program.cap > 2 * cone_max(program.exists * jnp.abs(u[0]))
+    needed = jnp.where(far, violation, jnp.zeros_like(violation))
+    most = cone_sum(needed) if program.price is None else cone_max(needed)
+    most = most + jnp.asarray(64 * unit_roundoff(most.dtype), most.dtype) * vector_norm(rows)
+    return rows / jnp.maximum(most, jnp.ones_like(most))
 
 
 @stage
