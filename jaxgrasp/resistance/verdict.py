@@ -14,7 +14,15 @@ import jax.numpy as jnp
 from ..backend import stage
 from ..conic import Cone, cone_min, cone_sum, entries, inner, interior_distance, matvec, rmatvec, vector_norm
 from ..contacts import Folded, Tile, normalized, onto_null_space, smallest_slack, to_body, to_twist, unfold
-from ..core import Array, Status, first_of, nan_where, perturbation_tolerance, rounding_constant, unit_roundoff
+from ..core import (
+    Array,
+    Status,
+    first_of,
+    nan_where,
+    perturbation_tolerance,
+    rounding_constant,
+    unit_roundoff,
+)
 from .problem import bound_of, upper_bound
 
 __all__ = ["Rank", "Verdict", "judge", "unnoticed"]
