@@ -111,6 +111,7 @@ HOST = {
     "trace": "a log of one grasp for people",
     "place_contacts": "searches in rounds on the host",
     "check": "proves in NumPy",
+    "prove": "proves in NumPy and integers",
     "save_grasp": "writes a file",
     "load_grasp": "reads a file",
     "close_loop": "simulates; its steps are compiled inside",
