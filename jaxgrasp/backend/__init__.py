@@ -12,11 +12,12 @@ from .tiles import (
     to_lanes,
     to_rows,
 )
-from .xla import inlined, is_traced, kernel, stage
+from .xla import fori_loop, inlined, is_traced, kernel, stage, varying_like, while_loop
 
 __all__ = [
     "Sweeps",
     "batched",
+    "fori_loop",
     "in_chunks",
     "in_sweeps",
     "inlined",
@@ -31,4 +32,6 @@ __all__ = [
     "to_lanes",
     "to_rows",
     "usable_backend",
+    "varying_like",
+    "while_loop",
 ]

@@ -18,7 +18,7 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 
 from ..core import Array, placed
-from .xla import kernel
+from .xla import kernel, while_loop
 
 __all__ = [
     "Sweeps",
@@ -65,11 +65,17 @@ def _count(rows: Any) -> int:
 
 
 def padded_rows(rows: Rows, width: int) -> Rows:
-    """``rows`` with zero rows appended up to the next multiple of ``width``, at least one tile."""
+    """``rows`` up to the next multiple of ``width``, at least one tile: the last is repeated, which costs no iteration
+    and is a problem as sound as its own; zeros where there is none."""
     extra = max(1, -(-_count(rows) // width)) * width - _count(rows)
     if not extra:
         return rows
-    return jax.tree.map(lambda x: jnp.concatenate([x, jnp.zeros((extra, *x.shape[1:]), x.dtype)]), rows)
+
+    def pad(x: Array) -> Array:
+        last = x[-1:] if len(x) else jnp.zeros((1, *x.shape[1:]), x.dtype)
+        return jnp.concatenate([x, jnp.broadcast_to(last, (extra, *x.shape[1:]))])
+
+    return jax.tree.map(pad, rows)
 
 
 def map_tiles(kernel: Callable[[Any], Any], rows: Any, count: Array, width: int) -> Any:
@@ -93,7 +99,7 @@ def map_tiles(kernel: Callable[[Any], Any], rows: Any, count: Array, width: int)
         return tile + jnp.int32(1), updated
 
     tiles = _tiles(count, width)
-    return lax.while_loop(lambda carry: carry[0] < tiles, one_tile, (jnp.int32(0), out))[1]
+    return while_loop(lambda carry: carry[0] < tiles, one_tile, (jnp.int32(0), out), (rows, count))[1]
 
 
 def _tiles(count: Array, width: int) -> Array:
@@ -124,7 +130,7 @@ def map_selected(kernel: Callable[[Any], Any], selected: Array, rows: Any, out: 
         updated = jax.tree.map(lambda x, r: x.at[chosen].set(r, mode="drop"), current, result)
         return tile_number + jnp.int32(1), updated
 
-    return lax.while_loop(pending, one_tile, (jnp.int32(0), out))[1]
+    return while_loop(pending, one_tile, (jnp.int32(0), out), (rows, selected))[1]
 
 
 class Packing:
@@ -177,7 +183,7 @@ def in_sweeps(sweeps: Sweeps, rows: Any, aside: Any, like: Any, count: Array, wi
     """
     n = _count(rows)
     given, known, made = Packing(rows), Packing(aside), Packing(like)
-    source = given.pack(rows)
+    source, everything = given.pack(rows), (rows, aside, count)
     shapes = jax.eval_shape(made.pack, like)
     out = jax.tree.map(lambda s: jnp.zeros((n, *s.shape[1:]), s.dtype), shapes)
     live = jnp.arange(n, dtype=jnp.int32) < count
@@ -202,17 +208,17 @@ def in_sweeps(sweeps: Sweeps, rows: Any, aside: Any, like: Any, count: Array, wi
             updated = jax.tree.map(lambda x, r: x.at[chosen].set(r, mode="drop"), current, result)
             return tile + jnp.int32(1), updated
 
-        out = lax.while_loop(lambda carry: carry[0] < tiles, one_tile, (jnp.int32(0), out))[1]
+        out = while_loop(lambda carry: carry[0] < tiles, one_tile, (jnp.int32(0), out), everything)[1]
         return number + 1, aside, out
 
     start = (jnp.int32(0), known.pack(aside), out)
-    return made.unpack(lax.while_loop(lambda carry: carry[0] < sweeps.count, sweep, start)[2])
+    return made.unpack(while_loop(lambda carry: carry[0] < sweeps.count, sweep, start, everything)[2])
 
 
 def in_chunks(solve: Callable[[Any, Array], Any], rows: Any, batch: tuple[int, ...], chunk: int) -> Any:
     """``solve(rows, count)`` on chunks of one shape, so that every batch size runs one executable; batch axes restored.
 
-    ``rows`` is a pytree of concrete arrays with the batch axes in front; the last chunk is padded with zeros.
+    ``rows`` is a pytree of concrete arrays with the batch axes in front; the last chunk repeats its last row.
     """
     flat = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[len(batch) :]), rows)
     n = _count(flat)
@@ -224,7 +230,8 @@ def in_chunks(solve: Callable[[Any, Array], Any], rows: Any, batch: tuple[int, .
             piece = x[start : start + count]
             if count == chunk:
                 return piece
-            return np.concatenate([piece, np.zeros((chunk - count, *x.shape[1:]), x.dtype)])
+            last = piece[-1:] if count else np.zeros((1, *x.shape[1:]), x.dtype)
+            return np.concatenate([piece, np.broadcast_to(last, (chunk - count, *x.shape[1:]))])
 
         result = solve(jax.tree.map(part, flat), placed(np.asarray(count, np.int32)))
         results.append(jax.tree.map(lambda x, c=count: np.asarray(x)[:c], result))

@@ -31,7 +31,7 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 
-__all__ = ["inlined", "is_traced", "kernel", "stage"]
+__all__ = ["fori_loop", "inlined", "is_traced", "kernel", "stage", "varying_like", "while_loop"]
 
 SWITCH = "JAXGRASP_KERNELS"
 
@@ -44,6 +44,44 @@ _SMALL = {"inlineable": "false", "xla_cpu_small_call": "true"}
 def is_traced(tree: Any) -> bool:
     """Whether a leaf of ``tree`` stands for a number that is not known yet: under ``jit``, ``vmap`` or ``grad``."""
     return any(isinstance(x, Tracer) for x in jax.tree.leaves(tree))
+
+
+def _varying(x: Any) -> frozenset[str]:
+    """The axes of ``jax.shard_map`` along which x differs from device to device, as far as this JAX says so."""
+    kind = jax.typeof(x)
+    kind = getattr(kind, "manual_axis_type", None) or kind
+    return frozenset(getattr(kind, "varying", None) or getattr(kind, "vma", None) or ())
+
+
+def varying_like(tree: Any) -> Callable[[Any], Any]:
+    """What makes all arrays of a tree differ between devices where one of ``tree`` does; elsewhere it changes nothing.
+
+    ``jax.shard_map`` checks that a loop's carry, or both ways of a choice, agree in that.
+    """
+    axes = frozenset().union(*(_varying(x) for x in jax.tree.leaves(tree)))
+
+    def cast(x: Any) -> Any:
+        missing = tuple(axes - _varying(x))
+        return lax.pcast(x, missing, to="varying") if missing else x
+
+    return functools.partial(jax.tree.map, cast)
+
+
+def while_loop(
+    unfinished: Callable[[Any], Any], body: Callable[[Any], Any], init: Any, like: Any = ()
+) -> Any:
+    """``lax.while_loop`` that ``jax.shard_map`` can check: ``init`` may hold constants, the same on every device.
+
+    ``like``  what ``body`` reads besides: its results differ between devices where this does
+    """
+    cast = varying_like((init, like))
+    return lax.while_loop(unfinished, lambda carry: cast(body(carry)), cast(init))
+
+
+def fori_loop(lower: int, upper: int, body: Callable[[Any, Any], Any], init: Any, like: Any = ()) -> Any:
+    """``lax.fori_loop``, as ``while_loop``."""
+    cast = varying_like((init, like))
+    return lax.fori_loop(lower, upper, lambda i, carry: cast(body(i, carry)), cast(init))
 
 
 @contextmanager
@@ -65,7 +103,7 @@ def _called(function: Callable, attributes: dict[str, str]) -> Callable:
 
     @functools.wraps(function)
     def wrapper(*args: Any) -> Any:
-        if _INLINED.get():
+        if _INLINED.get() or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
             return function(*args)
         if jax.default_backend() != "cpu" or not _attributes_known():
             # Fusions that compute a value twice round it twice, and a step that was checked is then not the step taken.
@@ -104,10 +142,11 @@ def _kind(args: tuple[Any, ...]) -> Any:
     """What a trace depends on: shapes, types and tree of the arguments, and JAX's rules for types."""
     leaves, tree = jax.tree.flatten(args)
     shapes = tuple(
-        (np.shape(x), jnp.result_type(x), getattr(jax.typeof(x), "weak_type", False)) for x in leaves
+        (np.shape(x), jnp.result_type(x), getattr(jax.typeof(x), "weak_type", False), _varying(x))
+        for x in leaves
     )
     rules = [getattr(jax.config, name) for name in ("jax_enable_x64", "jax_numpy_dtype_promotion")]
-    return tree, shapes, *rules
+    return tree, shapes, jax.sharding.get_abstract_mesh(), *rules
 
 
 def _call(

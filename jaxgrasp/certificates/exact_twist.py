@@ -30,7 +30,7 @@ def escape_twist(grasp: ExactGrasp, lane: Scaled, xi: np.ndarray) -> Twist | Non
     if grasp.escapes(direct):
         return direct
     x = _velocities(lane, xi)
-    size = np.linalg.norm(lane.A) * np.linalg.norm(xi)
+    size = float(np.linalg.norm(lane.A) * np.linalg.norm(xi))
     unseen = np.linalg.norm(x, axis=-1) <= UNSEEN * size
     if unseen.any():
         still = _at_rest(grasp, direct, np.flatnonzero(unseen))

@@ -142,7 +142,7 @@ def _proved(
     done = verdict & facts.at_least & facts.at_most
     level, distance = np.where(sound & done, 2, 0), np.zeros(len(sound))
     for i in np.flatnonzero(sound & ~done):
-        lane = ExactLane(known, i, dimension, claim.s[i], claim.escape[i], claim.bound[i], NEARBY * eps)
+        lane = ExactLane(known, int(i), dimension, claim.s[i], claim.escape[i], claim.bound[i], NEARBY * eps)
         proved = bool(verdict[i]), bool(facts.at_least[i]), bool(facts.at_most[i])
         ends = float(claim.lower[i]), float(claim.upper[i])
         level[i], distance[i] = _exactly(lane, int(claim.status[i]), ends, not full[i], proved)

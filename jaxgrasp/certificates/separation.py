@@ -33,7 +33,7 @@ def prove_separation(
     shown = _separates(asked, twist, rates)
     level, distance = np.where(lanes & shown, 2, 0), np.zeros(len(lanes))
     for lane in np.flatnonzero(lanes & ~shown & np.isfinite(twist).all(-1)):
-        level[lane], distance[lane] = _in_integers(asked, wrench[lane], twist[lane], lane, nearby)
+        level[lane], distance[lane] = _in_integers(asked, wrench[lane], twist[lane], int(lane), nearby)
     return level, distance
 
 

@@ -92,9 +92,14 @@ class Multipliers(NamedTuple):
 def _infeasibility(program: ConvexConeProgram, point: ConvexPoint) -> Array:
     applied, product = program.products(point.u)
     total = vector_norm(program.rhs - applied)
-    for missing in program.bound_residuals(point.u, product, point.slack):
-        if missing is not None:
-            total = total + cone_sum(jnp.abs(missing))
+    missing = program.bound_residuals(point.u, product, point.slack)
+    if missing.cap is not None:  # beside a large cap even its rounding is large
+        missing = missing._replace(
+            cap=missing.cap / jnp.maximum(point.slack.cap, jnp.ones_like(point.slack.cap))
+        )
+    for lacking in missing:
+        if lacking is not None:
+            total = total + cone_sum(jnp.abs(lacking))
     return total
 
 

@@ -157,8 +157,9 @@ def _recovered(
     dz = program.gradient(du, rows, price.net())
     total = rates.sum_on_head()
     if total is not None:
-        error = (frame.head_of_unscaled(stored_spectral(q)) - dz[0]) / jnp.where(
-            total > 0, total, jnp.ones_like(total)
+        # Where the rates are small, ``r * s`` has lost nothing, and a price as small would drown in rounding of dz.
+        error = (frame.head_of_unscaled(stored_spectral(q)) - dz[0]) / jnp.maximum(
+            total, jnp.ones_like(total)
         )
         error = exists * error
         if price.level is not None:

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ..backend import stage
+from ..backend import fori_loop, stage
 from ..core import Array, pivot_tolerance, unit_roundoff, widest_scaling
 from .cholesky import Cholesky, solve_lower, solve_transposed
 from .cone import Cone, cone_sum, inner
@@ -131,7 +131,7 @@ def kkt_solve(
         return x, _residual(kkt, frame, change, x, rhs)
 
     nothing = jax.tree.map(jnp.zeros_like, rhs)
-    return lax.fori_loop(0, 1 + REFINEMENTS, refine, (nothing, rhs))[0]
+    return fori_loop(0, 1 + REFINEMENTS, refine, (nothing, rhs))[0]
 
 
 # Stages of the solve, which nothing differentiates.

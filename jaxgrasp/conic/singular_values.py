@@ -9,9 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import lax
 
-from ..backend import stage
+from ..backend import fori_loop, stage
 from ..core import Array
 
 __all__ = ["RowSVD", "row_svd"]
@@ -78,7 +77,7 @@ def row_svd(A: Array) -> RowSVD:
     rows = jnp.concatenate([rows, jnp.zeros((seats - m, width + m, lanes), A.dtype)], axis=0)
     halves = (rows[: seats // 2], rows[seats // 2 :])
     rounds = SWEEPS * (seats - 1)  # whole sweeps bring every row back to its seat
-    halves = lax.fori_loop(0, rounds, lambda _, x: _round(x, width), halves)
+    halves = fori_loop(0, rounds, lambda _, x: _round(x, width), halves)
     rows = jnp.concatenate(halves, axis=0)[:m]
     square = rows[:, 0] * rows[:, 0]
     for j in range(1, width):

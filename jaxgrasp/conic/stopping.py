@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
-from jax import lax
 
+from ..backend import while_loop
 from ..core import Array, Status
 
 __all__ = ["StallRule", "first_code", "iterate_until_stopped"]
@@ -50,4 +50,4 @@ def iterate_until_stopped(advance: Callable[[State], State], state: State, budge
         count, state = carry
         return count + 1, advance(state)
 
-    return lax.while_loop(unfinished, body, (jnp.int32(0), state))[1]
+    return while_loop(unfinished, body, (jnp.int32(0), state), budget)[1]

@@ -38,7 +38,7 @@ from .projection import (
     to_twist,
 )
 from .tiled_derivatives import BatchAxes, filled, masked, safe_contacts, tiled, tiled_solver, zero_tangent
-from .validity import is_grasp, nonzero, sound
+from .validity import cleared, is_grasp, nonzero, sound
 
 __all__ = [
     "Axes",
@@ -58,6 +58,7 @@ __all__ = [
     "Projection",
     "SoftFinger",
     "Tile",
+    "cleared",
     "component_names",
     "cone_use",
     "contact_model",

@@ -17,6 +17,7 @@ from jax.typing import ArrayLike
 from ..core import Array, Float, contact_frame, normalize, orientation_matrix, real_array
 from .grasp import Grasp
 from .models import Component
+from .validity import cleared
 
 __all__ = ["Axes", "TorqueLimits", "component_vectors", "contact_frames", "force_vectors"]
 
@@ -27,13 +28,15 @@ def contact_frames(grasp: Grasp) -> Float[Array, "*batch k d d"]:
     """``F_i = [t_1 t_2 n]`` in space, ``[t n]`` in the plane: the axes of contact i as columns, in body axes.
 
     Rotations where the contact is in space: ``t_1 x t_2 = n``; in the plane ``t x n = +e_z``. No unit. ``F_i f_i`` is
-    the force of a hard finger, in N and body axes. NaN where a normal is zero or not finite.
+    the force of a hard finger, in N and body axes, and ``F_i^T J_i`` the rows of a hand Jacobian in contact axes (for
+    all contact models at once: ``TorqueLimits(J, tau_max, axes="body")``). Those of the last axis where a contact is
+    inactive; NaN where an active one has a normal that is zero or not finite.
 
     ValueError where ``grasp`` is no ``Grasp``. Source: Duff et al., Building an orthonormal basis, revisited, 2017.
     """
     if not isinstance(grasp, Grasp):
         raise ValueError(f"contact_frames takes a jaxgrasp.Grasp, got {type(grasp).__name__}")
-    normal = normalize(grasp.normal)
+    normal = normalize(cleared(grasp).normal)
     return jnp.stack([*contact_frame(normal), normal], axis=-1)
 
 
@@ -78,7 +81,7 @@ def component_vectors(
 
 def force_vectors(
     grasp: Grasp,
-    force: Float[Array, "*batch kn"],
+    force: Float[ArrayLike, "*batch kn"],
     *,
     axes: Axes = "body",
     orientation: Float[ArrayLike, "*batch o"] | None = None,
@@ -93,6 +96,7 @@ def force_vectors(
     """
     B = component_vectors(grasp, axes=axes, orientation=orientation)
     n = B.shape[-1]
+    force = real_array(force, "force")
     if force.ndim < 1 or force.shape[-1] != grasp.contacts * n:
         raise ValueError(f"force must have shape (*batch, {grasp.contacts * n}), got {force.shape}")
     parts = force.reshape(*force.shape[:-1], grasp.contacts, n)
@@ -104,7 +108,7 @@ class TorqueLimits(eqx.Module):
 
     jacobian     (*batch, R, q) maps joint rates to the velocities of the contacts, row for row of the forces in these
                  axes: contact axes R = k n, body and world axes R = k d (soft fingers: 2 k d, velocity then rotation)
-    torque       (q) or (*batch, q), N m, positive
+    torque       (q) or (*batch, q), N m, positive; infinite: no limit
     axes         "contact" (default), "body" or "world"
     orientation  of the body in the world, for world axes, as for ``component_vectors``
 

@@ -5,15 +5,16 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..core import Array, Float
+from ..core import Array, Float, safe_root
 from .grasp import Grasp
+from .validity import cleared
 
 __all__ = ["cone_use", "into_cones", "nearest_admissible"]
 
 
 def _scaled(grasp: Grasp, force: Array) -> tuple[Array, Array, int]:
     """(*batch, k, n) forces over their scaling, zero where a component does not exist; the scaling; f_n's place."""
-    scale = jnp.where(grasp.active[..., None], grasp.model.scaling(grasp.dimension), 0.0)
+    scale = jnp.where(grasp.active[..., None], cleared(grasp).model.scaling(grasp.dimension), 0.0)
     parts = force.reshape(*force.shape[:-1], grasp.contacts, scale.shape[-1])
     safe = jnp.where(scale > 0, scale, 1.0)
     return jnp.where(scale > 0, parts / safe, 0.0), scale, grasp.model.normal_index(grasp.dimension)
@@ -23,7 +24,7 @@ def _split(scaled: Array, index: int) -> tuple[Array, Array]:
     """Normal component and psi."""
     normal = scaled[..., index]
     square = jnp.sum(scaled * scaled, axis=-1) - normal * normal
-    return normal, jnp.sqrt(jnp.maximum(square, 0.0))
+    return normal, safe_root(square)
 
 
 @eqx.filter_jit

@@ -9,6 +9,7 @@ from ..conic import null_basis, singular_values
 from ..core import Array, Float, Int, contact_frame, cross, normalize, rank_tolerance, wrench_dimension
 from .grasp import Grasp
 from .models import Component
+from .validity import cleared
 
 __all__ = [
     "contact_wrenches",
@@ -48,12 +49,13 @@ def contact_wrenches(
     return jnp.stack(columns, axis=-1)
 
 
-def _stacked(grasp: Grasp, scale: Array | None) -> Array:
+def _stacked(grasp: Grasp, *, folded: bool) -> Array:
+    grasp = cleared(grasp)
     columns = contact_wrenches(
         grasp.position, normalize(grasp.normal), grasp.model.components(grasp.dimension)
     )
-    if scale is not None:
-        columns = columns * scale[..., None, :]
+    if folded:
+        columns = columns * grasp.model.scaling(grasp.dimension)[..., None, :]
     columns = jnp.where(grasp.active[..., None, None], columns, 0.0)
     joined = jnp.moveaxis(columns, -3, -2)  # (*batch, m, k, n)
     return joined.reshape(*joined.shape[:-2], -1)
@@ -65,7 +67,7 @@ def grasp_map(grasp: Grasp) -> Float[Array, "*batch m kn"]:
 
     Returns (*batch, m, k n); force components in the chapter's order; columns of inactive contacts are zero.
     """
-    return _stacked(grasp, None)
+    return _stacked(grasp, folded=False)
 
 
 @eqx.filter_jit
@@ -74,14 +76,13 @@ def folded_grasp_map(grasp: Grasp) -> Float[Array, "*batch m kn"]:
 
     Its range is the span of what the friction cones can do, so its rank is the one that counts.
     """
-    return _stacked(grasp, grasp.model.scaling(grasp.dimension))
+    return _stacked(grasp, folded=True)
 
 
 @eqx.filter_jit
 def length_scale(grasp: Grasp) -> Float[Array, "*batch"]:
     """``L = max_i |p_i|`` over the active contacts in m, or 1 where that is zero."""
-    squares = jnp.sum(grasp.position**2, axis=-1)
-    largest = jnp.max(jnp.where(grasp.active, squares, 0.0), axis=-1)
+    largest = jnp.max(jnp.sum(cleared(grasp).position ** 2, axis=-1), axis=-1)
     there = largest > 0
     return jnp.where(there, jnp.sqrt(jnp.where(there, largest, 1.0)), 1.0)
 

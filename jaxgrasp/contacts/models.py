@@ -16,7 +16,7 @@ from enum import Enum
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..core import Array, ArrayLike, Float, real_array, uniform
+from ..core import Array, ArrayLike, Float, real_array, safe_root, uniform
 
 __all__ = [
     "Component",
@@ -108,7 +108,7 @@ class ContactModel(eqx.Module):
         ratio = jnp.where(force == 0, 0.0, force / jnp.where(scale > 0, scale, 1.0))
         ratio = jnp.where((scale <= 0) & (force != 0), jnp.inf, ratio)
         tangential = jnp.delete(ratio, self.normal_index(dimension), axis=-1)
-        return jnp.sqrt(jnp.sum(tangential * tangential, axis=-1))
+        return safe_root(jnp.sum(tangential * tangential, axis=-1))
 
     @eqx.filter_jit
     def feasibility_slack(
@@ -126,7 +126,7 @@ class ContactModel(eqx.Module):
         scaled = velocity * self.scaling(dimension)
         tangential = jnp.delete(scaled, self.normal_index(dimension), axis=-1)
         normal = velocity[..., self.normal_index(dimension)]
-        return normal - jnp.sqrt(jnp.sum(tangential * tangential, axis=-1))
+        return normal - safe_root(jnp.sum(tangential * tangential, axis=-1))
 
 
 def _symmetric_unit(size: int, row: int, column: int, dtype) -> Array:
@@ -316,7 +316,7 @@ def contact_model(
     name: str, friction: Float[ArrayLike, "*batch"], torsion: Float[ArrayLike, "*batch"]
 ) -> ContactModel:
     """The model of this name in ``MODELS`` with mu and gamma (m) per contact; those it does not have are left out."""
-    return MODELS[name]().with_coefficients(jnp.asarray(friction), jnp.asarray(torsion))
+    return MODELS[name]().with_coefficients(real_array(friction, "friction"), real_array(torsion, "torsion"))
 
 
 def model_name(model: ContactModel) -> str:

@@ -80,8 +80,10 @@ class Tile(NamedTuple):
 
     @property
     def coefficients(self) -> tuple[Array, Array]:
-        """``mu, gamma`` of the contacts, (k, L)."""
-        return to_lanes(self.contacts.friction), to_lanes(self.contacts.torsion)
+        """``mu, gamma`` of the contacts (k, L), 0 where there is none."""
+        there, zero = self.folded.exists > 0, jnp.zeros_like(self.folded.exists)
+        friction, torsion = to_lanes(self.contacts.friction), to_lanes(self.contacts.torsion)
+        return jnp.where(there, friction, zero), jnp.where(there, torsion, zero)
 
 
 def tile_of(contacts: Contacts, components: tuple[Component, ...], dimension: int) -> Tile:

@@ -12,7 +12,7 @@ from jax import lax
 from ..core import Array, Bool, size_limit
 from .grasp import Grasp
 
-__all__ = ["is_grasp", "nonzero", "sound"]
+__all__ = ["cleared", "is_grasp", "nonzero", "sound"]
 
 
 def _magnitude(coordinates: tuple[Array, ...]) -> Array:
@@ -66,3 +66,18 @@ def is_grasp(grasp: Grasp) -> Bool[Array, "*batch"]:
     model = grasp.model
     coefficients = model.friction_coefficient, model.torsion_coefficient
     return sound(position, normal, *coefficients, grasp.active, lambda x: jnp.max(x, axis=-1))
+
+
+@eqx.filter_jit
+def cleared(grasp: Grasp, live: Bool[Array, "*batch k"] | None = None) -> Grasp:
+    """The grasp with harmless numbers where no contact is, by default in padding: whatever stood there is not read.
+
+    ``0 * NaN`` is NaN: what is only masked afterwards spoils derivatives. Contacts without ``live`` become inactive.
+    """
+    live = grasp.active if live is None else live
+    model = grasp.model
+    coefficients = (jnp.where(live, c, 0.0) for c in (model.friction_coefficient, model.torsion_coefficient))
+    upright = jnp.zeros(grasp.dimension, grasp.dtype).at[-1].set(1.0)
+    position = jnp.where(live[..., None], grasp.position, 0.0)
+    normal = jnp.where(live[..., None], grasp.normal, upright)
+    return Grasp(position, normal, model.with_coefficients(*coefficients), live)

@@ -42,7 +42,7 @@ from .rotations import (
     rotation_between,
     turned,
 )
-from .select import bracket_width, first_of, part_of
+from .select import bracket_width, first_of, nan_where, part_of
 from .status import Status
 from .tolerances import (
     balance_tolerance,
@@ -96,6 +96,7 @@ __all__ = [
     "jacobian_solve",
     "largest_response",
     "load_limit",
+    "nan_where",
     "normalize",
     "normalize_components",
     "open_archive",

@@ -76,8 +76,7 @@ def normalize_components(v: Components) -> Components:
     size = jnp.abs(v[0])
     for x in v[1:]:
         size = jnp.maximum(size, jnp.abs(x))
-    safe = jnp.where(size > 0, size, jnp.full_like(size, jnp.nan))
-    scaled = tuple(x / safe for x in v)
+    scaled = tuple(x / size for x in v)  # 0 / 0 and inf / inf are NaN
     square = scaled[0] * scaled[0]
     for x in scaled[1:]:
         square = square + x * x

@@ -11,7 +11,7 @@ import numpy as np
 
 from .arrays import Array, Index, on_host, placed
 
-__all__ = ["bracket_width", "first_of", "part_of"]
+__all__ = ["bracket_width", "first_of", "nan_where", "part_of"]
 
 Batch = TypeVar("Batch")  # a pytree of arrays with the batch axes in front
 
@@ -45,3 +45,9 @@ def bracket_width(lower: Array, upper: Array) -> Array:
     """``upper - lower`` of a bracket; 0 where both are the same infinity."""
     same = lower == upper
     return jnp.where(same, jnp.zeros_like(lower), upper - lower)
+
+
+def nan_where(mask: Array, x: Array) -> Array:
+    """``x``, NaN where ``mask``. It is made there and nowhere else: ``jax.debug_nans`` would find a constant."""
+    one = jnp.ones_like(x)
+    return jnp.where(mask, jnp.sqrt(jnp.where(mask, -one, one)), x)

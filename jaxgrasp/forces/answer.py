@@ -23,10 +23,11 @@ from ..conic import (
     interior_distance,
     matvec,
     rmatvec,
+    tail_norm,
     vector_norm,
 )
 from ..contacts import Folded, to_body, to_twist, unfold
-from ..core import Array, Status, edge_tolerance, first_of, proven_limit, unit_roundoff
+from ..core import Array, Status, edge_tolerance, first_of, nan_where, proven_limit, unit_roundoff
 from .bounds import criterion_value, dual_value
 from .infeasibility import proven_separation
 from .problem import ForceProblem, Load
@@ -106,7 +107,10 @@ def _violation(program: ConvexConeProgram, u: Cone) -> Array:
         worst = jnp.maximum(worst, cone_max(over))
     if program.bound is not None:
         _, product = program.products(u)
-        worst = jnp.maximum(worst, cone_max(jnp.abs(product) - program.bound))
+        rows = [c[program.rhs.shape[0] :] for c in program.columns]
+        length = jnp.sqrt(sum(jnp.sum(c * c, axis=1) for c in rows))
+        over = (jnp.abs(product) - program.bound) / jnp.where(length > 0, length, jnp.ones_like(length))
+        worst = jnp.maximum(worst, cone_max(over))
     return jnp.maximum(worst, jnp.zeros_like(worst)) / jnp.where(largest > 0, largest, jnp.ones_like(largest))
 
 
@@ -140,6 +144,9 @@ def answer(problem: ForceProblem, state: ConvexState, tolerance: Array) -> Answe
     m, dtype = program.rhs.shape[0], problem.tile.folded.norm.dtype
     u = _polished(projection.basis.columns, program.rhs, program.exists, state.point.u)
     rows, ray = _all_rows(state.point), _to_size_one(state.ray)
+    linear = program.curvature is None and program.cone_floor is None
+    if program.cap is not None and linear and program.smoothing is None:
+        rows = _affordable(program, rows, u)
     found = Multipliers(rows, ray, to_twist(projection, rows[:m]), to_twist(projection, ray[:m]))
     values = _values(problem, state.point, u, found)
     load = load._replace(rest=load.rest & (problem.demand.criterion.barrier_weight is None))
@@ -184,6 +191,18 @@ def _to_size_one(ray: Array) -> Array:
     """A proof may be scaled by any positive number; the solver's grows, and may overflow, as long as it is sought."""
     largest = cone_max(jnp.abs(ray))
     return ray / jnp.where((largest > 0) & jnp.isfinite(largest), largest, jnp.ones_like(largest))
+
+
+@stage
+def _affordable(program: ConvexConeProgram, rows: Array, u: Cone) -> Array:
+    """``rows`` scaled down until contacts far below their caps need none: rounding there would cost the whole cap."""
+    x = rmatvec(program.columns, rows)
+    violation = program.exists * jnp.maximum(tail_norm(x) - x[0], jnp.zeros_like(x[0]))
+    far = program.cap > 2 * cone_max(program.exists * jnp.abs(u[0]))
+    needed = jnp.where(far, violation, jnp.zeros_like(violation))
+    most = cone_sum(needed) if program.price is None else cone_max(needed)
+    most = most + jnp.asarray(64 * unit_roundoff(most.dtype), most.dtype) * vector_norm(rows)
+    return rows / jnp.maximum(most, jnp.ones_like(most))
 
 
 @stage
@@ -233,11 +252,11 @@ def _in_user_units(
         if unbarred:  # no forces cost less than 0
             bound = jnp.maximum(bound, jnp.minimum(values.bound, jnp.zeros_like(bound)))
         m = found.twist.shape[0]
-        nan, inf = jnp.full_like(cost, jnp.nan), jnp.full_like(cost, jnp.inf)
+        inf = jnp.full_like(cost, jnp.inf)
         zero = jnp.zeros_like(cost)
 
         def final(x: Array, none: Array, where: Array) -> Array:
-            return jnp.where(invalid, nan, jnp.where(where, none, x))
+            return nan_where(invalid, jnp.where(where, none, x))
 
         resting = load.rest & optimal & (bound <= zero)
         force = unfold(tuple(load.size * x for x in u), tile.components, *coefficients)

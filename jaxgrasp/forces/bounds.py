@@ -126,7 +126,7 @@ def _linear_bound(program: ConvexConeProgram, dual: DualPoint) -> Array:
     scaled = jnp.where(largest > 0, dual.gain / needed, jnp.zeros_like(largest))
     over = violation - covered
     cap = jnp.full_like(over, jnp.inf) if program.cap is None else program.cap
-    paid = cone_sum(jnp.where(over > 0, over * cap, zero))
+    paid = cone_sum(jnp.where(over > 0, jnp.where(over > 0, over, 1) * cap, zero))
     return jnp.maximum(jnp.maximum(scaled, dual.gain - paid), jnp.zeros_like(scaled))
 
 

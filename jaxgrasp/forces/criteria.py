@@ -16,20 +16,20 @@ from abc import abstractmethod
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..contacts import Component, Grasp
-from ..core import Array, ArrayLike, Float
+from ..contacts import Component, Grasp, cleared
+from ..core import Array, ArrayLike, Float, real_array
 
 __all__ = ["Criterion", "Gentlest", "LeastNorm", "Robust", "SmallestSum", "SumOfSquares"]
 
 
 def _by_contact(grasp: Grasp, force: Array) -> Array:
     n = grasp.model.force_size(grasp.dimension)
-    return force.reshape(*force.shape[:-1], force.shape[-1] // n, n)
+    parts = force.reshape(*force.shape[:-1], force.shape[-1] // n, n)
+    return jnp.where(grasp.active[..., None], parts, jnp.zeros_like(parts))
 
 
 def _normal_forces(grasp: Grasp, force: Array) -> Array:
-    normal = _by_contact(grasp, force)[..., grasp.model.normal_index(grasp.dimension)]
-    return jnp.where(grasp.active, normal, jnp.zeros_like(normal))
+    return _by_contact(grasp, force)[..., grasp.model.normal_index(grasp.dimension)]
 
 
 class Criterion(eqx.Module):
@@ -102,8 +102,9 @@ class Robust(Criterion):
         """``max_i f_n,i - weight * sum_i log det P_i``, N; infinite outside the cones."""
         normal = _normal_forces(grasp, force)
         top = jnp.max(jnp.where(grasp.active, normal, -jnp.inf), axis=-1)
-        on_normal, on_cone, constant = grasp.model.log_det_terms(grasp.dimension)
-        psi = grasp.model.friction_function(_by_contact(grasp, force), grasp.dimension)
+        model = cleared(grasp).model
+        on_normal, on_cone, constant = model.log_det_terms(grasp.dimension)
+        psi = model.friction_function(_by_contact(grasp, force), grasp.dimension)
         inside = grasp.active & (normal > 0) & ((psi < normal) | (on_cone == 0))
         safe = jnp.where(inside, normal, 1.0)
         counted = inside & (on_cone > 0)
@@ -170,7 +171,7 @@ class LeastNorm(Criterion):
         """``sum_i |f_i|^2``, N^2."""
         parts = _by_contact(grasp, force)
         total = jnp.zeros(parts.shape[:-1], parts.dtype)
-        gamma = grasp.model.torsion_coefficient
+        gamma = cleared(grasp).model.torsion_coefficient
         for j, component in enumerate(grasp.model.components(grasp.dimension)):
             value = parts[..., j]
             if component is Component.SPIN:
@@ -184,9 +185,7 @@ class LeastNorm(Criterion):
 
 
 def _positive(value: ArrayLike, name: str) -> Array:
-    array = jnp.asarray(value)
-    if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
-        raise ValueError(f"{name} must be a positive number, or one per grasp, got {value!r}")
+    array = real_array(value, name, "a positive number, or one per grasp")
     if isinstance(value, int | float) and not value > 0:
         raise ValueError(f"{name} must be positive, got {value}")
-    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.result_type(float))
+    return array

@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 
-from ..contacts import Contacts, Grasp, TorqueLimits, contacts_of
+from ..contacts import Contacts, Grasp, TorqueLimits, cleared, contacts_of
 from ..core import Array, real_array, spread, widened, wrench_dimension
 from .criteria import Criterion
 from .problem import Demand
@@ -58,7 +58,7 @@ def demand_rows(
     criterion = jax.tree.map(lambda x: _weight(x.astype(dtype), batch, shape), criterion)
     log_det = None
     if criterion.barrier_weight is not None:
-        terms = grasp.model.log_det_terms(grasp.dimension)
+        terms = cleared(grasp).model.log_det_terms(grasp.dimension)
         a, b, c = (spread(x.astype(dtype), (k,), batch, "grasp", loads) for x in terms)
         log_det = (a, b, c)
     cap = None

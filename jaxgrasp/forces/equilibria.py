@@ -11,8 +11,8 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from ..conic import pseudo_inverse
-from ..contacts import Grasp, TorqueLimits, folded_grasp_map, length_scale
-from ..core import Answer, Array, Bool, Float, Int, Status, first_of, rank_tolerance
+from ..contacts import Grasp, TorqueLimits, cleared, folded_grasp_map, length_scale
+from ..core import Answer, Array, Bool, Float, Int, Status, first_of, rank_tolerance, real_array, safe_root
 from ..resistance import wrench_resistance
 from .criteria import Criterion, Gentlest, Robust, SmallestSum
 from .demand import spread_loads
@@ -54,7 +54,7 @@ class Equilibrium(Answer):
 @eqx.filter_jit
 def _slack(grasp: Grasp, force: Array) -> Array:
     n, loads = grasp.model.force_size(grasp.dimension), force.ndim - 1 - len(grasp.batch_shape)
-    wide = _with_load_axes(grasp, loads)
+    wide = _with_load_axes(cleared(grasp), loads)
     slack = wide.model.feasibility_slack(force.reshape(*force.shape[:-1], -1, n), grasp.dimension)
     return jnp.min(jnp.where(wide.active, slack, jnp.inf), axis=-1)
 
@@ -164,7 +164,7 @@ def squeeze(grasp: Grasp, wrench: Float[ArrayLike, "*batch m"]) -> Squeeze:
     missing = jnp.einsum("...ij,...j->...i", A, least) + scaled_load
     balanced = jnp.sqrt(jnp.sum(missing * missing, -1)) <= 1e-9 * jnp.sqrt(jnp.sum(scaled_load**2, -1))
 
-    scale = jnp.expand_dims(grasp.model.scaling(d), axes)
+    scale = jnp.expand_dims(cleared(grasp).model.scaling(d), axes)
     index = grasp.model.normal_index(d)
     p = least.reshape(*shape, k, n)
     internal = jnp.expand_dims(verdict.internal_force, axes).reshape(*scale.shape[:-2], k, n)
@@ -178,7 +178,7 @@ def squeeze(grasp: Grasp, wrench: Float[ArrayLike, "*batch m"]) -> Squeeze:
     live = jnp.expand_dims(grasp.active, axes)
     strict = jnp.where(live, (leading > 0) & (q[..., index] > 0), True)
     usable = jnp.all(strict, axis=-1) & balanced
-    root = jnp.sqrt(jnp.maximum(middle * middle - leading * rest, 0.0))
+    root = safe_root(middle * middle - leading * rest)
     safe = jnp.where(leading > 0, leading, 1.0)
     effort = jnp.max(jnp.where(live, (root - middle) / safe, 0.0), axis=-1)
     effort = jnp.where(usable, jnp.maximum(effort, 0.0), jnp.inf)
@@ -244,7 +244,7 @@ def resistible_wrenches(
     ``wrenches`` (T, m) go to every grasp, (*batch, T, m) to their own. Criterion (``Gentlest()`` by default), limits
     and tolerance as for ``optimize_forces``; every answer carries its proof in ``.forces``.
     """
-    array = jnp.asarray(wrenches)
+    array = real_array(wrenches, "wrenches")
     if array.ndim < 2:
         raise ValueError(f"wrenches must have shape (T, m) or (*batch, T, m), got {array.shape}")
     if array.ndim == 2:

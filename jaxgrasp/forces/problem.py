@@ -36,6 +36,9 @@ from .criteria import Criterion
 __all__ = ["Demand", "ForceProblem", "Load", "force_problem", "force_program"]
 
 
+FAR = 1e16  # loads: beside such forces the load itself is rounding, so that a larger cap is none
+
+
 class Demand(NamedTuple):
     """What is asked of each grasp, as rows.
 
@@ -128,34 +131,41 @@ def load_of(tile: Tile, demand: Demand) -> tuple[Load, Array]:
 
 
 @stage
-def _limits(
-    cap: Array | None, torque: Array | None, exists: Array, size: Array, norm: Array | None
-) -> tuple[Array | None, Array | None, Array]:
-    """Scaled caps and bounds; lanes whose limits are positive numbers."""
-    sound = jnp.ones_like(size) > 0
-    if cap is not None:
-        good = (cap > 0) | (exists == 0)  # NaN compares false
-        sound = sound & cone_all(good)
-        cap = jnp.where(good & (exists > 0), cap / size, jnp.full_like(cap, jnp.inf))
-    if torque is not None and norm is not None:
-        good = (torque > 0) & jnp.isfinite(torque)
-        sound = sound & cone_all(good)
-        torque = jnp.where(good, torque, jnp.ones_like(torque)) / (size * norm)
-    return cap, torque, sound
+def _scaled_caps(cap: Array, exists: Array, size: Array) -> tuple[Array, Array]:
+    """Scaled caps, infinite for none; lanes whose caps are positive numbers."""
+    good = (cap > 0) | (exists == 0)  # NaN compares false
+    cap = jnp.where(good & (exists > 0), cap / size, jnp.full_like(cap, jnp.inf))
+    return jnp.where(cap < FAR, cap, jnp.full_like(cap, jnp.inf)), cone_all(good)
+
+
+class TorqueRows(NamedTuple):
+    """``|E s| <= bound``: E with normal components first, what its rows were divided by, and which lanes are numbers.
+
+    Rows are divided by |J_j| or the limit, whichever is larger: a limit far above all torques is then like any other
+    that is not reached, and an infinite one is a row of zeros.
+    """
+
+    columns: Cone
+    bound: Array
+    norm: Array
+    sound: Array
 
 
 def torque_rows(
     demand: Demand,
     contacts: Contacts,
     exists: Array,
+    size: Array,
     components: tuple[Component, ...],
     row_norm: Array | None = None,
-) -> tuple[Cone, Array, Array]:
-    """E with ``E s = J^T f``, normal components first, rows of norm 1; the norms; which lanes are finite."""
+) -> TorqueRows:
+    """The rows of ``|J^T f| <= tau_max`` for forces ``size u``."""
     order = normal_first(components)
 
     @stage
-    def run(jacobian: Array, exists: Array, friction: Array, torsion: Array) -> tuple[Cone, Array, Array]:
+    def run(
+        jacobian: Array, torque: Array, exists: Array, size: Array, friction: Array, torsion: Array
+    ) -> TorqueRows:
         scale = {Component.NORMAL: jnp.ones_like(friction), Component.SPIN: torsion}
         zero = jnp.zeros_like(jacobian[0])
         parts, square = [], zero
@@ -167,18 +177,23 @@ def torque_rows(
                 rows.append(value)
                 square = square + value * value
             parts.append(rows)
-        norm = jnp.sqrt(square) if row_norm is None else row_norm
-        usable = jnp.isfinite(norm) & (norm > 0)
-        sound = cone_all(jnp.isfinite(norm))
-        norm = jnp.where(usable, norm, jnp.ones_like(norm))
-        columns = tuple(
-            jnp.stack([jnp.where(usable, x / norm, zero) for x in rows], axis=1) for rows in parts
-        )
-        return columns, norm, sound
+        good = torque > 0  # NaN compares false
+        reach = jnp.where(good, torque, jnp.ones_like(torque)) / size
+        sound = cone_all(jnp.isfinite(square) & good)
+        limited = jnp.isfinite(reach) & jnp.isfinite(square)
+        reach = jnp.where(limited, reach, jnp.ones_like(reach))
+        norm = row_norm
+        if norm is None:
+            longest = jnp.maximum(jnp.sqrt(jnp.where(limited, square, zero)), reach)
+            norm = jnp.where(limited & (longest > 0), longest, jnp.full_like(reach, jnp.inf))
+        used = jnp.isfinite(norm)
+        safe = jnp.where(used, norm, jnp.ones_like(norm))
+        columns = tuple(jnp.stack([jnp.where(used, x / safe, zero) for x in rows], axis=1) for rows in parts)
+        return TorqueRows(columns, jnp.where(used, reach / safe, jnp.ones_like(reach)), norm, sound)
 
-    assert demand.jacobian is not None
-    arrays = (to_lanes(demand.jacobian), exists, to_lanes(contacts.friction), to_lanes(contacts.torsion))
-    return run(*arrays)
+    assert demand.jacobian is not None and demand.torque is not None
+    limits = to_lanes(demand.jacobian), to_lanes(demand.torque)
+    return run(*limits, exists, size, to_lanes(contacts.friction), to_lanes(contacts.torsion))
 
 
 @stage
@@ -239,17 +254,14 @@ def force_program(
     ``row_norm`` fixes what the torque rows are divided by.
     """
     criterion = demand.criterion
-    sound = exists[0] == exists[0]
+    sound, cap, bound = [exists[0] == exists[0]], None, None
     if demand.jacobian is not None:
-        rows, norm, sound = torque_rows(demand, contacts, exists, components, row_norm)
-        columns, row_norm = _joined(columns, rows), norm
-    cap, bound, good = _limits(
-        None if demand.cap is None else to_lanes(demand.cap),
-        None if demand.torque is None else to_lanes(demand.torque),
-        exists,
-        size,
-        row_norm,
-    )
+        limits = torque_rows(demand, contacts, exists, size, components, row_norm)
+        columns, bound, row_norm = _joined(columns, limits.columns), limits.bound, limits.norm
+        sound.append(limits.sound)
+    if demand.cap is not None:
+        cap, good = _scaled_caps(to_lanes(demand.cap), exists, size)
+        sound.append(good)
     cone_floor = head_floor = None
     barrier = demand.barrier()
     if barrier is not None:
@@ -268,7 +280,7 @@ def force_program(
         head_floor,
         None if demand.smoothing is None else _per_size(demand.smoothing, size, curved is not None),
     )
-    return program, row_norm, _all([sound, good])
+    return program, row_norm, _all(sound)
 
 
 def _per_size(smoothing: Array, size: Array, squared: bool) -> Array:

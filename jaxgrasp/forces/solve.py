@@ -254,8 +254,8 @@ def optimize_forces(
                    ``LeastNorm(length)``
     max_normal     N, a number or one per contact, infinite for none
     torque_limits  (J, tau_max): J (*batch, k n, q) maps joint rates to contact velocities in the contacts' own
-                   frames, so ``J^T f`` are the joint torques (N m); |J^T f| <= tau_max, (q) and positive. For J in
-                   body or world axes: ``TorqueLimits(J, tau_max, axes="world", orientation=..)``
+                   frames, so ``J^T f`` are the joint torques (N m); |J^T f| <= tau_max, (q) and positive, infinite
+                   for none. For J in body or world axes: ``TorqueLimits(J, tau_max, axes="world", orientation=..)``
     tolerance      duality gap to reach, relative to the cost
     smoothing      barrier parameter, in units of the cost, at which to stop (default 0: the optimum itself). The
                    forces are then those of the smooth central path, whose derivatives have no kinks; ``gap`` says

@@ -44,7 +44,7 @@ def _first_prices(program: ConvexConeProgram, u: Cone, depth: Array, count: Arra
     if program.cap is not None and masks.cap is not None:
         room = jnp.where(masks.cap > 0, program.cap, one) - u[0]
         cap = jnp.where(masks.cap > 0, jnp.maximum(room, depth / 2), one)
-        cap_price = jnp.where(masks.cap > 0, share / 2, one)
+        cap_price = jnp.where(masks.cap > 0, share * depth / (4 * cap), one)
     if program.head_floor is not None:
         head = u[0]
         head_price = jnp.where(exists > 0, jnp.minimum(program.head_floor / u[0], share / 2), one)

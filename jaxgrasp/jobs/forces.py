@@ -14,14 +14,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
 
 from ..backend import precision
 from ..certificates import check
-from ..contacts import Component, Grasp, contact_model
-from ..core import Status, UserError, claimed, contact_frame, normalize
+from ..contacts import Grasp, contact_model, force_vectors
+from ..core import Status, UserError, claimed
 from ..forces import OptimalForces, closeness, optimize_forces
 from ..formats import Contacts, Forces, as_row, force_schema, force_table, write
 from .forces_request import ForcesPlan
@@ -42,14 +41,7 @@ def _grasp(plan: ForcesPlan, contacts: Contacts) -> Grasp:
 
 def _in_mesh_axes(grasp: Grasp, force: jax.Array) -> np.ndarray:
     """``f_x t_1 + f_y t_2 + f_n n`` (N, k, d) of forces (N, k n); 0 where there is no contact."""
-    components = grasp.model.components(grasp.dimension)
-    parts = np.asarray(force).reshape(-1, grasp.contacts, len(components))
-    normal = normalize(grasp.normal)
-    tangents = contact_frame(normal)
-    axes = {Component.TANGENT_1: tangents[0], Component.TANGENT_2: tangents[-1], Component.NORMAL: normal}
-    vectors = sum(
-        parts[..., j, None] * np.asarray(axes[c]) for j, c in enumerate(components) if c is not Component.SPIN
-    )
+    vectors = np.asarray(force_vectors(grasp, force))[..., : grasp.dimension]
     return np.where(np.asarray(grasp.active)[..., None], vectors, 0.0)
 
 
@@ -67,7 +59,7 @@ def _solve(plan: ForcesPlan, contacts: Contacts) -> _Solved:
     found: OptimalForces = jax.block_until_ready(
         optimize_forces(
             grasp,
-            jnp.asarray(plan.load.wrench),
+            plan.load.wrench,
             criterion=plan.criterion,
             max_normal=request.max_normal,
             tolerance=request.tolerance,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -173,6 +173,8 @@ def plan_forces(request: ForcesRequest) -> ForcesPlan:
     criterion = make_criterion(request.criterion, weight=request.weight, length=request.length)
     status = _status(request.status)
     positive_option("tolerance", request.tolerance)
+    if request.max_normal == float("inf"):  # no limit
+        request = replace(request, max_normal=None)
     positive_option("max-normal", request.max_normal)
     for name, value in (("chunk", request.chunk), ("threads", request.threads)):
         if value is not None and value < 1:

@@ -6,7 +6,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..core import Array, Status, gap_goal, rank_tolerance, unit_roundoff
+from ..backend import fori_loop, while_loop
+from ..core import Array, Status, gap_goal, nan_where, rank_tolerance, unit_roundoff
 from .problem import LMIProblem, LMISolution, LogDetTerm, check_shapes, over_batch
 
 __all__ = ["lmi_minimize", "minimize"]
@@ -175,7 +176,7 @@ def _line_search(slope: Array, bend: Array, eigenvalues: Array, counts: Array) -
         rising = slope + middle * bend - jnp.sum(counts * eigenvalues / (1 + middle * eigenvalues)) > 0
         return jnp.where(rising, low, middle), jnp.where(rising, middle, high)
 
-    low, _ = jax.lax.fori_loop(0, 20, bisect, (jnp.zeros_like(wall), jnp.minimum(wall, 16.0)))
+    low, _ = fori_loop(0, 20, bisect, (jnp.zeros_like(wall), jnp.minimum(wall, 16.0)))
     return low
 
 
@@ -184,7 +185,7 @@ def _square_root(H: Array) -> Array:
     values, vectors = jnp.linalg.eigh(H)
     rounding = len(H) * rank_tolerance(H.dtype) * jnp.max(jnp.abs(values))
     root = jnp.sqrt(jnp.maximum(values, 0.0))[:, None] * vectors.T
-    return jnp.where(values[0] >= -rounding, root, jnp.nan)
+    return nan_where(~(values[0] >= -rounding), root)
 
 
 def minimize(problem: LMIProblem, goal: Array, max_steps: int = MAX_STEPS) -> LMISolution:
@@ -235,14 +236,14 @@ def _minimize(problem: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
         x=problem.start,
         factor=factor,
         term_factor=term_factor,
-        value=jnp.where(interior, value, jnp.nan),
+        value=nan_where(~interior, value),
         weight=jnp.ones((), dtype),
         bound=jnp.full((), -jnp.inf, dtype),
         dual=jnp.zeros_like(problem.constant),
         steps=jnp.zeros((), jnp.int32),
         stalled=~(interior & space.held),  # not held: the cost falls for ever
     )
-    end = jax.lax.while_loop(unfinished, advance, start)
+    end = while_loop(unfinished, advance, start)
     status = jnp.where(good(end), Status.OPTIMAL.value, Status.STALLED.value)
     status = jnp.where(jnp.isfinite(end.value), status, Status.INVALID.value).astype(jnp.int32)
     lower = jnp.minimum(end.bound, end.value)

@@ -19,6 +19,8 @@ from ..core import (
     Status,
     bracket_width,
     gap_goal,
+    nan_where,
+    real_array,
     rounding_constant,
     unit_roundoff,
 )
@@ -49,7 +51,7 @@ def second_order_cone_lmi(
     Returns Q_0 (*batch, q, q) and Q_1 .. Q_N (*batch, N, q, q), q = a + 1. The lower right entry is the
     scalar c.x + d (erratum 12: not a second multiple of I).
     """
-    A, b, c, d = (jnp.asarray(value) for value in (A, b, c, d))
+    A, b, c, d = (real_array(value, name) for value, name in zip((A, b, c, d), "Abcd", strict=True))
     expect_shape(A.ndim >= 2, "A", "(*batch, a, N)", A)
     rows, columns = A.shape[-2:]
     expect_shape(b.shape[-1:] == (rows,), "b", f"(*batch, {rows})", b)
@@ -127,7 +129,7 @@ def lmi_feasibility(
     at least 1 / tolerance. An LMI that has solutions only as x grows without bound, or none but almost (``[[x, 1],
     [1, 0]]``), is MARGINAL. Wrong shapes raise ValueError.
     """
-    constant, matrices = jnp.asarray(constant), jnp.asarray(matrices)
+    constant, matrices = real_array(constant, "constant"), real_array(matrices, "matrices")
     N, q = matrices.shape[-3], constant.shape[-1]
     expect_shape(constant.shape[-2:] == (q, q), "constant", "(*batch, q, q)", constant)
     expect_shape(matrices.shape[-3:] == (N, q, q), "matrices", f"(*batch, N, {q}, {q})", matrices)
@@ -238,13 +240,15 @@ def sdp_minimize(
     symmetric matrices (erratum 3: they need not be positive semidefinite). ``lmi_feasibility`` finds the start;
     ``lmi_minimize`` takes it from there. Wrong shapes raise ValueError.
     """
-    u, constant, matrices = (jnp.asarray(x) for x in (u, constant, matrices))
+    u, constant, matrices = (
+        real_array(x, name) for x, name in ((u, "u"), (constant, "constant"), (matrices, "matrices"))
+    )
     N, q = u.shape[-1], constant.shape[-1]
     expect_shape(constant.shape[-2:] == (q, q), "constant", "(*batch, q, q)", constant)
     expect_shape(matrices.shape[-3:] == (N, q, q), "matrices", f"(*batch, {N}, {q}, {q})", matrices)
     phase = lmi_feasibility(constant, matrices, tolerance=tolerance)
     feasible = phase.status == Status.FEASIBLE.value
-    start = jnp.where(feasible[..., None], phase.x, jnp.nan)
+    start = nan_where(~feasible[..., None], phase.x)
     end = lmi_minimize(LMIProblem(u, constant, matrices, start), tolerance=tolerance)
     batch = end.batch_shape
     phase = jax.tree.map(lambda x: jnp.broadcast_to(x, (*batch, *x.shape[feasible.ndim :])), phase)

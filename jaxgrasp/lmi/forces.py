@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from ..conic import pseudo_inverse
-from ..contacts import Grasp, TorqueLimits, grasp_map, is_grasp, length_scale, null_space
+from ..contacts import Grasp, TorqueLimits, cleared, grasp_map, is_grasp, length_scale, null_space
 from ..core import (
     Answer,
     Array,
@@ -25,6 +25,7 @@ from ..core import (
     Int,
     Status,
     gap_goal,
+    nan_where,
     rank_tolerance,
     real_array,
     spread,
@@ -125,7 +126,7 @@ def lmi_forces(
 def _load(grasp: Grasp, wrench) -> Array:
     """(*batch, *loads, m)."""
     batch, m = grasp.batch_shape, wrench_dimension(grasp.dimension)
-    array = jnp.asarray(wrench)
+    array = real_array(wrench, "wrench")
     if array.ndim == 1 and array.shape == (m,):
         return jnp.broadcast_to(array.astype(grasp.dtype), (*batch, m))
     if (
@@ -192,10 +193,11 @@ def _optimize(grasp: Grasp, criterion: Criterion, limit, torques, wrench: Array,
     status = jnp.where(reduced.rest > goal, Status.INFEASIBLE.value, status)
     status = jnp.where(valid, status, Status.INVALID.value).astype(jnp.int32)
     found = (status == Status.OPTIMAL.value) | (status == Status.STALLED.value)
-    without = jnp.where(status == Status.INFEASIBLE.value, jnp.inf, jnp.nan)
+    without = jnp.where(found, 0.0, jnp.inf)
+    without = nan_where(~found & (status != Status.INFEASIBLE.value), without)
     return LMIForces(
         status=status,
-        force=jnp.where(found, force, jnp.nan),
+        force=nan_where(~found, force),
         upper=jnp.where(found, criterion.cost(grasp, force), without),
         lower=jnp.where(found, scale * end.lower + offset, without),
     )
@@ -208,7 +210,7 @@ def _reduce(grasp: Grasp, limit, torques, wrench: Array) -> _Reduced:
     load = wrench * per_length
     size = jnp.linalg.norm(load)
     size = jnp.where(size > 0, size, 1.0)
-    scaling = jnp.where(grasp.active[:, None], grasp.model.scaling(grasp.dimension), 0.0)
+    scaling = jnp.where(grasp.active[:, None], cleared(grasp).model.scaling(grasp.dimension), 0.0)
     exists = scaling.reshape(-1) != 0  # components with coefficient 0 stay exactly 0
     G = jnp.where(exists, grasp_map(grasp), 0.0) * per_length[:, None]
     particular = -pseudo_inverse(G, rank_tolerance(grasp.dtype)) @ (load / size)
@@ -297,7 +299,7 @@ def _level_problem(
 
     log_det, offset = None, jnp.zeros_like(size)
     if criterion.barrier_weight is not None:
-        on_normal, on_cone, _ = grasp.model.log_det_terms(grasp.dimension)
+        on_normal, on_cone, _ = cleared(grasp).model.log_det_terms(grasp.dimension)
         counted = _counted(on_cone, len(constant))
         log_det = LogDetTerm(
             criterion.barrier_weight / size,

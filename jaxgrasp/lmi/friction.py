@@ -12,8 +12,8 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ..conic import eigenvalues
-from ..contacts import Grasp, is_grasp, null_space
-from ..core import Array, Bool, Float, rank_tolerance
+from ..contacts import Grasp, cleared, is_grasp, null_space
+from ..core import Array, Bool, Float, nan_where, rank_tolerance
 from .barrier import lmi_minimize
 from .problem import LMIProblem, expect_shape
 
@@ -62,12 +62,12 @@ def friction_lmi(grasp: Grasp) -> FrictionLMI:
     lambda_min is ``mu (f_n - psi)`` for hard fingers (11.4), ``f_n - psi`` for soft ones (11.35), and ``f_n``
     for frictionless contacts and wherever mu = 0.
     """
-    return _block_diagonal(grasp, grasp.model.lmi_matrices(grasp.dimension))
+    return _block_diagonal(grasp, cleared(grasp).model.lmi_matrices(grasp.dimension))
 
 
 def _normalised_friction_lmi(grasp: Grasp) -> FrictionLMI:
     """The friction LMI with ``lambda_min = f_n - psi`` in every block: hard blocks divided by mu."""
-    blocks = grasp.model.lmi_matrices(grasp.dimension)
+    blocks = cleared(grasp).model.lmi_matrices(grasp.dimension)
     diagonal = blocks[
         ..., grasp.model.normal_index(grasp.dimension), 0, 0
     ]  # S_n = diagonal * I in every model
@@ -140,4 +140,4 @@ def lmi_margin(grasp: Grasp, *, tolerance: float = 1e-8) -> Float[Array, "*batch
     """
     problem, squeezes = _margin_problem(grasp)
     margin = -lmi_minimize(problem, tolerance=tolerance).upper
-    return jnp.where(is_grasp(grasp), jnp.where(squeezes, margin, -jnp.inf), jnp.nan)
+    return nan_where(~is_grasp(grasp), jnp.where(squeezes, margin, -jnp.inf))

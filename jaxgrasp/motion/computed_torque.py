@@ -29,6 +29,7 @@ from ..core import (
     cross,
     jacobian_product,
     jacobian_solve,
+    real_array,
     rotate,
     rotate_wrench,
     rotation_between,
@@ -87,7 +88,7 @@ class Gains(eqx.Module):
 
 
 def _gain(value: ArrayLike, name: str) -> Array:
-    array = jnp.asarray(value, float)
+    array = real_array(value, name)
     if isinstance(array, Tracer):
         return array
     matrix = np.atleast_2d(array)
@@ -123,7 +124,7 @@ class Reference(eqx.Module):
 
         Velocities and accelerations are its exact derivatives.
         """
-        times = jnp.asarray(times, float)
+        times = real_array(times, "times")
         one = jnp.ones((), times.dtype)
 
         def velocity(t: Array) -> Array:
@@ -244,11 +245,11 @@ class ComputedTorque(ContactController):
     ):
         self.gains = gains
         self.criterion = SumOfSquares() if criterion is None else criterion
-        self.max_normal = None if max_normal is None else jnp.asarray(max_normal, float)
+        self.max_normal = None if max_normal is None else real_array(max_normal, "max_normal")
         self.torque_limits = None
         if torque_limits is not None:
             jacobian, largest = torque_limits
-            self.torque_limits = (jnp.asarray(jacobian, float), jnp.asarray(largest, float))
+            self.torque_limits = (real_array(jacobian, "the hand Jacobian J"), real_array(largest, "tau_max"))
         self.tolerance = tolerance
 
     def check(self, timestep: float, dimension: int) -> None:

@@ -25,7 +25,18 @@ from jax.typing import ArrayLike
 
 from ..conic import left_svd, singular_values
 from ..contacts import Grasp
-from ..core import Answer, Array, Float, Int, Status, first_of, rank_tolerance, wrench_dimension
+from ..core import (
+    Answer,
+    Array,
+    Float,
+    Int,
+    Status,
+    first_of,
+    nan_where,
+    rank_tolerance,
+    real_array,
+    wrench_dimension,
+)
 from ..resistance import wrench_resistance
 from .linearization import Linearization, Scaled, first_order, is_equilibrium, linearize, scaled_system
 from .rigid_body import RigidBody
@@ -114,7 +125,7 @@ def gramian(
     powers = [B]
     for _ in range(3):
         powers.append(A @ powers[-1])
-    horizon = jnp.asarray(horizon, B.dtype)[..., None, None]
+    horizon = real_array(horizon, "horizon").astype(B.dtype)[..., None, None]
     total = jnp.zeros_like(A)
     for i, left in enumerate(powers):
         for j, right in enumerate(powers):
@@ -175,7 +186,7 @@ def _proved(linear: Linearization, resistance: Array, body: RigidBody, system: S
         jnp.where(unknown, -1, rank),
         jnp.where(unknown, -1, reduced_rank),
         jnp.where(unknown, -1, alone),
-        jnp.where(none, jnp.nan, values),
+        nan_where(none, values),
         jnp.where(none, 0.0, motion),
         jnp.where(none, 0.0, weakest),
         jnp.where(full & ~unknown, effort, jnp.inf),

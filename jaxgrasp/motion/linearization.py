@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from ..contacts import Grasp, folded_grasp_map, grasp_map, is_grasp, length_scale
+from ..contacts import Grasp, cleared, folded_grasp_map, grasp_map, is_grasp, length_scale
 from ..core import (
     Answer,
     Array,
@@ -104,7 +104,7 @@ def _judged(grasp: Grasp, load: Array, force: Array) -> tuple[Array, Array]:
     """What given forces are, and their slack."""
     d, n = grasp.dimension, grasp.model.force_size(grasp.dimension)
     parts = force.reshape(*force.shape[:-1], grasp.contacts, n)
-    slack = jnp.where(grasp.active, grasp.model.feasibility_slack(parts, d), jnp.inf)
+    slack = jnp.where(grasp.active, cleared(grasp).model.feasibility_slack(parts, d), jnp.inf)
     slack = jnp.min(slack, axis=-1)
     left = applied(grasp_map(grasp), force) + load
     per_length = jnp.where(jnp.arange(load.shape[-1]) < d, 1.0, 1 / length_scale(grasp)[..., None])
@@ -205,15 +205,7 @@ def _about(
 @eqx.filter_jit
 def _sound(grasp: Grasp) -> Grasp:
     """The grasp with harmless numbers wherever a contact does not exist or its lane is none: no NaN, no derivative."""
-    live = grasp.active & is_grasp(grasp)[..., None]
-    upright = jnp.zeros(grasp.dimension, grasp.dtype).at[-1].set(1.0)
-    scaling = (
-        jnp.where(live, c, jnp.zeros_like(c))
-        for c in (grasp.model.friction_coefficient, grasp.model.torsion_coefficient)
-    )
-    position = jnp.where(live[..., None], grasp.position, 0.0)
-    normal = jnp.where(live[..., None], grasp.normal, upright)
-    return Grasp(position, normal, grasp.model.with_coefficients(*scaling), live)
+    return cleared(grasp, grasp.active & is_grasp(grasp)[..., None])
 
 
 def _tilt(gravity: Array) -> Array:
@@ -226,7 +218,7 @@ def _tilt(gravity: Array) -> Array:
 def _blocks(grasp: Grasp, body: RigidBody, gravity: Array) -> tuple[Array, Array]:
     """A_c and ``B_c = M^-1 G^W`` at the identity orientation."""
     d, m = grasp.dimension, wrench_dimension(grasp.dimension)
-    scale = jnp.where(grasp.active[..., None], grasp.model.scaling(d), 0.0)
+    scale = jnp.where(grasp.active[..., None], cleared(grasp).model.scaling(d), 0.0)
     exists = (scale > 0).reshape(*scale.shape[:-2], 1, -1)
     G = jnp.where(exists, grasp_map(grasp), 0.0)
     B_c = jnp.concatenate(

@@ -14,11 +14,11 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import lax
 from jax.typing import ArrayLike
 
+from ..backend import fori_loop
 from ..conic import solve
-from ..contacts import Grasp, grasp_map, nearest_admissible
+from ..contacts import Grasp, cleared, grasp_map, nearest_admissible
 from ..core import Array, Bool, Float, Int, Status, applied
 from .computed_torque import Command, ContactController, Reference, tracking_error
 from .linearization import Scaled, is_equilibrium, linearize, scaled_system
@@ -47,7 +47,7 @@ def riccati(
         H_next = H + transposed(A) @ H @ solved_A
         return A @ solved_A, (G_next + transposed(G_next)) / 2, (H_next + transposed(H_next)) / 2
 
-    return lax.fori_loop(0, DOUBLINGS, double, (A, B @ transposed(B) / weight, Q))[2]
+    return fori_loop(0, DOUBLINGS, double, (A, B @ transposed(B) / weight, Q))[2]
 
 
 class Regulator(ContactController):
@@ -110,7 +110,7 @@ def _image(system: Scaled, timestep: Array) -> tuple[Array, Array]:
 
 def _settles(A: Array) -> Array:
     """Whether the powers of A vanish."""
-    power, _ = lax.fori_loop(0, 20, lambda _, now: (now[0] @ now[0], now[1]), (A, A))
+    power, _ = fori_loop(0, 20, lambda _, now: (now[0] @ now[0], now[1]), (A, A))
     return jnp.all(jnp.isfinite(power), axis=(-1, -2)) & (jnp.max(jnp.abs(power), axis=(-1, -2)) < 1e-3)
 
 
@@ -123,7 +123,7 @@ def _design(grasp: Grasp, system: Scaled, timestep: Array, weight: float) -> tup
     X = riccati(A, B, unit, weight)
     costate = X @ solve(unit + B @ jnp.swapaxes(B, -1, -2) @ X / weight, A)
     scaled = jnp.swapaxes(B, -1, -2) @ costate / weight
-    scaling = jnp.where(grasp.active[..., None], grasp.model.scaling(d), 0.0)
+    scaling = jnp.where(grasp.active[..., None], cleared(grasp).model.scaling(d), 0.0)
     scaling = scaling.reshape(*scaling.shape[:-2], -1)
     one = jnp.ones_like(system.length)
     units = jnp.stack([1 / system.length] * d + [one] * (states // 2 - d), axis=-1)

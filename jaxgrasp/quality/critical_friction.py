@@ -20,9 +20,9 @@ import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
 
-from ..backend import is_traced
+from ..backend import is_traced, while_loop
 from ..contacts import ContactModel, Grasp
-from ..core import Answer, Array, Float, Int, Status, wrench_dimension
+from ..core import Answer, Array, Float, Int, Status, nan_where, real_array, wrench_dimension
 from ..resistance import WrenchResistance, wrench_resistance
 
 __all__ = ["CriticalFriction", "critical_friction", "friction_sweep", "with_friction_factor"]
@@ -62,7 +62,7 @@ class CriticalFriction(Answer):
 
 def with_friction_factor(grasp: Grasp, factor: Float[ArrayLike, "*batch"]) -> Grasp:
     """The grasp with ``factor * mu`` for every mu, gamma unchanged; ``factor`` a number or one a grasp."""
-    return _rougher(grasp, jnp.asarray(factor, grasp.dtype))
+    return _rougher(grasp, real_array(factor, "factor").astype(grasp.dtype))
 
 
 @eqx.filter_jit
@@ -77,7 +77,7 @@ def friction_sweep(
     grasp: Grasp, factors: Float[ArrayLike, " T"], *, verdict_only: bool = False
 ) -> WrenchResistance:
     """The verdicts at each of T factors on all mu, in one call: a ``WrenchResistance`` with batch axes (*batch, T)."""
-    array = jnp.asarray(factors, grasp.dtype)
+    array = real_array(factors, "factors", "a list of numbers").astype(grasp.dtype)
     if array.ndim != 1:
         raise ValueError(f"factors must be a list of numbers, shape (T,), got {array.shape}")
 
@@ -182,7 +182,7 @@ def _open(bracket: _Bracket, width: float) -> Array:
 def _ends(end: _Bracket, below: Array, above: Array) -> tuple[Array, Array]:
     """Both ends, from the bracket and the margins at the least and the most friction."""
     always, never = below > 0, ~(above > 0)
-    nan = jnp.where(jnp.isnan(above), jnp.nan, jnp.zeros_like(above))
+    nan = nan_where(jnp.isnan(above), jnp.zeros_like(above))
     lower = jnp.where(always, -jnp.inf, jnp.where(never, jnp.log(MOST), end.low))
     upper = jnp.where(always, jnp.log(LEAST), jnp.where(never, jnp.inf, end.high))
     return lower + nan, upper + nan
@@ -216,7 +216,7 @@ def _grasp(data: _Data, model: ContactModel, active: Array) -> Grasp:
 def _critical(data: _Data, model: ContactModel, active: Array) -> tuple[Array, Array, Array]:
     grasp = _grasp(data, model, active)
     traced = is_traced(grasp)
-    return _factors(*_search(grasp, lax.while_loop if traced else _python_loop))
+    return _factors(*_search(grasp, while_loop if traced else _python_loop))
 
 
 @jax.jit

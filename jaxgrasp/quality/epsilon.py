@@ -22,11 +22,11 @@ import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
 
-from ..backend import batched, in_chunks, is_traced, map_tiles
+from ..backend import batched, in_chunks, is_traced, map_tiles, varying_like
 from ..certificates import prove_epsilon, proved_by
 from ..conic import left_svd, solve
-from ..contacts import Grasp
-from ..core import Answer, Array, Bool, Float, Int, Status
+from ..contacts import Grasp, cleared
+from ..core import Answer, Array, Bool, Float, Int, Status, nan_where
 from ..resistance import WrenchResistance, wrench_resistance
 from .polytope import Capacity, Polytope, begin, grow, widen
 from .unit_wrench_space import NORMS, effort_map, extreme_force, scaled, support, torque_lengths
@@ -176,7 +176,8 @@ def _solve_rows(plan: _Plan, rows: _Rows, count: Array, tolerance: Array) -> _Fo
         none = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)._replace(
             facets=jnp.full(shapes.facets.shape, -1, shapes.facets.dtype)
         )
-        found = lax.cond(resistant, search, lambda: none)
+        cast = varying_like((row, tolerance))
+        found = lax.cond(resistant, lambda: cast(search()), lambda: cast(none))
         return jax.tree.map(lambda x: x[None], found)
 
     return map_tiles(one, rows, count, 1)
@@ -216,7 +217,7 @@ def _to_components(grasp: Grasp, s: Array) -> Array:
     index = grasp.model.normal_index(grasp.dimension)
     n = s.shape[-1]
     order = [*range(1, index + 1), 0, *range(index + 1, n)]
-    scale = grasp.model.scaling(grasp.dimension)
+    scale = cleared(grasp).model.scaling(grasp.dimension)
     extra = s.ndim - scale.ndim
     scale = jnp.expand_dims(scale, tuple(range(scale.ndim - 2, scale.ndim - 2 + extra)))
     f = s[..., jnp.array(order)] * scale
@@ -280,7 +281,7 @@ def _answer(
     moved = jnp.where(resistant[..., None, None, None], A, lax.stop_gradient(A))
     slope = jnp.einsum("...m,...kmn,...kn->...", direction, moved, found.touching)
     change = slope - lax.stop_gradient(slope)
-    nan = jnp.where(verdict.status == Status.INVALID.value, jnp.nan, 0.0)[..., None]
+    nan = nan_where(verdict.status == Status.INVALID.value, jnp.zeros_like(edge))[..., None]
     return EpsilonQuality(
         verdict.status,
         lower + change,
@@ -308,7 +309,7 @@ def _bound(status: Array, inside: Array, outside: Array) -> Array:
     """``inside`` where RESISTANT, 0 where NOT_RESISTANT, NaN where INVALID, else ``outside``."""
     value = jnp.where(status == Status.NOT_RESISTANT.value, 0.0, outside)
     value = jnp.where(status == Status.RESISTANT.value, inside, value)
-    return jnp.where(status == Status.INVALID.value, jnp.nan, value)
+    return nan_where(status == Status.INVALID.value, value)
 
 
 @functools.partial(jax.jit, static_argnames=("norm",))

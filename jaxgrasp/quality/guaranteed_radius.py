@@ -25,11 +25,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
+from ..backend import fori_loop
 from ..conic import pseudo_inverse, singular_values
-from ..contacts import Grasp, length_scale
-from ..core import Answer, Array, Float, Int, Status, normalize, rank_tolerance, safe_root
+from ..contacts import Grasp, cleared, length_scale
+from ..core import Answer, Array, Float, Int, Status, nan_where, normalize, rank_tolerance, safe_root
 from ..resistance import wrench_resistance
 from .unit_wrench_space import effort_map, scaled
 
@@ -123,7 +123,7 @@ def _response(data: _Data, resistant: Array) -> _Response:
         _spectral(turned[:, :, 1:]),
         _norm(inverse[:, 0, d:]),
         _spectral(inverse[:, 1:, d:]),
-        jnp.sqrt(jnp.sum(inverse**2, axis=(1, 2))),
+        safe_root(jnp.sum(inverse**2, axis=(1, 2))),
         singular_values(wide)[-1],
     )
 
@@ -135,7 +135,7 @@ def _resistant_slack(data: _Data, response: _Response, r: Array) -> Array:
     c = _chord(r)
     s = data.force
     mu, gamma = data.friction, data.torsion
-    pull = jnp.sqrt(s[:, 0] ** 2 + (mu * _norm(s[:, 1 : min(n, d)])) ** 2)  # |F_i|
+    pull = safe_root(s[:, 0] ** 2 + (mu * _norm(s[:, 1 : min(n, d)])) ** 2)  # |F_i|
     spin = jnp.abs(gamma * s[:, 3]) if n == 4 else jnp.zeros_like(pull)
     moved = r * pull + c * spin  # the torque a displaced, turned contact adds, besides its lever
     # e_i and its size
@@ -190,7 +190,7 @@ def _radius(data: _Data, resistant: Array) -> Array:
         return jnp.where(good, middle, low), jnp.where(good, high, middle)
 
     zero = jnp.zeros((), data.A.dtype)
-    low, _ = lax.fori_loop(0, HALVINGS, halve, (zero, zero + LARGEST))
+    low, _ = fori_loop(0, HALVINGS, halve, (zero, zero + LARGEST), (data, resistant))
     return low
 
 
@@ -251,8 +251,9 @@ def _problem(
     def safe(x: Array, value: float) -> Array:
         return jnp.where(live.reshape(*live.shape, *([1] * (x.ndim - live.ndim))), x, value)
 
-    over = safe(grasp.position / length[..., None, None], 0.0)
-    normal = safe(normalize(grasp.normal), 0.0)
+    harmless = cleared(grasp, live)
+    over = harmless.position / length[..., None, None]
+    normal = safe(normalize(harmless.normal), 0.0)
     s = scaled(grasp, safe(force.reshape(*batch, grasp.contacts, -1), 0.0).reshape(force.shape))
     scaled_twist = jnp.concatenate([twist[..., :d], twist[..., d:] * length[..., None]], axis=-1)
     size = _norm(scaled_twist)[..., None]
@@ -264,8 +265,8 @@ def _problem(
         jnp.where(known, A, identity),
         over,
         normal,
-        safe(grasp.model.friction_coefficient, 0.0),
-        safe(grasp.model.torsion_coefficient, 0.0) / length[..., None],
+        harmless.model.friction_coefficient,
+        harmless.model.torsion_coefficient / length[..., None],
         live,
         s,
         jnp.where(valid[..., None], scaled_twist, 0.0),
@@ -277,4 +278,4 @@ def _problem(
 @jax.jit
 def _radii(data: _Data, kind: _Kind) -> Array:
     radius = jax.vmap(_radius)(data, kind.resistant)
-    return jnp.where(kind.valid, jnp.where(kind.resistant | kind.escaping, radius, 0.0), jnp.nan)
+    return nan_where(~kind.valid, jnp.where(kind.resistant | kind.escaping, radius, 0.0))

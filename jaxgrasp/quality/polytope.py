@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from ..backend import while_loop
 from ..core import Array, visibility_tolerance
 
 __all__ = ["Capacity", "Growth", "Polytope", "begin", "grow", "widen"]
@@ -237,4 +238,4 @@ def grow(polytope: Polytope, support: Support, tolerance: Array, capacity: Capac
         grown = _insert(polytope, point, label, capacity)
         return jax.tree.map(lambda a, b: jnp.where(done, a, b), closed, grown)
 
-    return lax.while_loop(running, step, polytope)
+    return while_loop(running, step, polytope)

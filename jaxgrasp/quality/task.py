@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from ..contacts import Grasp
-from ..core import Answer, Array, Float, Int, Status
+from ..core import Answer, Array, Float, Int, Status, nan_where
 from ..forces import Gentlest, OptimalForces, SmallestSum, resistible_wrenches
 from .unit_wrench_space import NORMS
 
@@ -69,7 +69,7 @@ def _worst_of(status: Array, forces: OptimalForces) -> TaskQuality:
     multiple = jnp.where(most == 0, jnp.inf, multiple)
     invalid = jnp.any(status == Status.INVALID.value, axis=-1)
     worst = jnp.argmax(effort, axis=-1).astype(jnp.int32)
-    multiple = jnp.where(invalid, jnp.nan, multiple)
+    multiple = nan_where(invalid, multiple)
     return TaskQuality(_whole(status), multiple, effort, worst, forces)
 
 

@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
 
-from ..contacts import Grasp, folded_grasp_map, length_scale
-from ..core import Array, Bool, Float, safe_root, wrench_dimension
+from ..contacts import Grasp, cleared, folded_grasp_map, length_scale, normal_first
+from ..core import Array, Bool, Float, real_array, safe_root, wrench_dimension
 
 __all__ = [
     "NORMS",
@@ -43,12 +44,18 @@ def torque_lengths(
     if torque_scale is None:
         return lax.stop_gradient(length_scale(grasp))
     try:
-        given = jnp.asarray(torque_scale, grasp.dtype)
+        given = real_array(torque_scale, "torque_scale").astype(grasp.dtype)
         return jnp.broadcast_to(given, grasp.batch_shape)
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"torque_scale must be a length in m, or one a grasp, shape {grasp.batch_shape}; got {torque_scale!r}"
         ) from error
+
+
+def _normal_first(grasp: Grasp) -> np.ndarray:
+    """Where the components of a scaled force stand in the chapter's order."""
+    components = grasp.model.components(grasp.dimension)
+    return np.array([components.index(c) for c in normal_first(components)])
 
 
 @eqx.filter_jit
@@ -58,20 +65,16 @@ def effort_map(grasp: Grasp, length: Float[Array, "*batch"]) -> Float[Array, "*b
     rows = jnp.arange(m) < grasp.dimension
     A = folded_grasp_map(grasp) * jnp.where(rows, 1.0, 1 / length[..., None])[..., None]
     blocks = jnp.moveaxis(A.reshape(*A.shape[:-1], grasp.contacts, n), -3, -2)
-    index = grasp.model.normal_index(grasp.dimension)
-    order = jnp.array([index, *(j for j in range(n) if j != index)])
-    return blocks[..., order]
+    return blocks[..., _normal_first(grasp)]
 
 
 @eqx.filter_jit
 def scaled(grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch k n"]:
     """s with f = (mu, mu, 1, gamma) s, normal component first; 0 where a component does not exist."""
-    scale = grasp.model.scaling(grasp.dimension)
+    scale = cleared(grasp).model.scaling(grasp.dimension)
     s = force.reshape(*force.shape[:-1], *scale.shape[-2:])
     s = jnp.where(scale > 0, s / jnp.where(scale > 0, scale, 1.0), 0.0)
-    index = grasp.model.normal_index(grasp.dimension)
-    order = jnp.array([index, *(j for j in range(s.shape[-1]) if j != index)])
-    return s[..., order]
+    return s[..., _normal_first(grasp)]
 
 
 def contact_support(A: Array, direction: Array) -> tuple[Array, Array, Array]:

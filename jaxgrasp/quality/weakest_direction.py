@@ -14,8 +14,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import lax
 
+from ..backend import fori_loop, while_loop
 from ..conic import solve
 from ..core import Array, stationary_tolerance
 
@@ -68,7 +68,7 @@ def weakest_direction(A: Array, norm: str, near: Touch, upper: Array) -> Touch:
         return i + 1, _newton(A, norm, near, upper, guesses[i, 0], guesses[i, 1])
 
     start = (jnp.int32(0), near._replace(sound=jnp.asarray(False)))
-    return lax.while_loop(open_guess, try_one, start)[1]
+    return while_loop(open_guess, try_one, start, A)[1]
 
 
 class _System(NamedTuple):
@@ -151,7 +151,7 @@ def _newton(A: Array, norm: str, near: Touch, upper: Array, core_below: Array, e
     start = jnp.concatenate([
         near.direction, (near.direction @ (system.wide @ near.forces.reshape(-1)))[None], near.forces.reshape(-1)
     ])  # fmt: skip
-    x = lax.fori_loop(0, STEPS, step, start)
+    x = fori_loop(0, STEPS, step, start, A)
     residual, _ = system(x)
     d, s = x[:m], x[m + 1 :].reshape(k, n)
     tail = jnp.sqrt(jnp.sum(s[:, 1:] ** 2, axis=-1))

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from ..backend import stage
 from ..conic import Cone, cone_min, cone_sum, entries, inner, interior_distance, matvec, rmatvec, vector_norm
 from ..contacts import Folded, Tile, normalized, onto_null_space, smallest_slack, to_body, to_twist, unfold
-from ..core import Array, Status, first_of, rounding_constant, unit_roundoff
+from ..core import Array, Status, first_of, nan_where, rounding_constant, unit_roundoff
 from .problem import bound_of, upper_bound
 from .rank import Rank, unnoticed
 
@@ -115,7 +115,7 @@ def judge(tile: Tile, rank: Rank, u: Cone, y: Array, unbounded: Array, tolerance
     one = jnp.ones_like(folded.norm)
 
     def valid(x: Array) -> Array:
-        return jnp.where(folded.valid, x, jnp.nan * one)
+        return nan_where(~folded.valid, x)
 
     return Verdict(
         status,

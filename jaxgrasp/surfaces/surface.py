@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ..core import Array, ArrayLike, Float, contact_frame
+from ..core import Array, ArrayLike, Float, contact_frame, nan_where, real_array
 
 __all__ = [
     "SmoothSurface",
@@ -34,22 +34,18 @@ __all__ = [
 
 def _points(value: ArrayLike, dtype: Any) -> Array:
     """``value`` as (*batch, 3) of ``dtype``; ValueError for any other shape."""
-    array = jnp.asarray(value)
+    array = real_array(value, "points")
     if array.ndim < 1 or array.shape[-1] != 3:
         raise ValueError(f"points must have shape (*batch, 3), got {array.shape}")
-    if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
-        raise ValueError(f"points must hold real numbers, got dtype {array.dtype}")
     return array.astype(dtype)
 
 
 def parameter(value: ArrayLike, shape: tuple[int, ...], name: str, positive: bool = True) -> Array:
     """A real parameter of a shape; ValueError for a wrong shape and, where the value is known, a wrong number."""
-    array = jnp.asarray(value)
+    array = real_array(value, name)
     if array.shape != shape:
         what = "a number" if shape == () else f"an array of shape {shape}"
         raise ValueError(f"{name} must be {what}, got shape {array.shape}")
-    if not jnp.issubdtype(array.dtype, jnp.floating):
-        array = array.astype(jnp.result_type(float))
     if not isinstance(array, Tracer):
         known = np.asarray(array)
         if not np.isfinite(known).all() or (positive and (known <= 0).any()):
@@ -226,6 +222,6 @@ def _lanes(surface: SmoothSurface, question: str, shape: str, point: Array) -> A
     def lane(p: Array) -> Any:
         finite = jnp.isfinite(p).all()
         answer = getattr(surface, question)(jnp.where(finite, p, surface.centre + surface.radius))
-        return jax.tree.map(lambda a: jnp.where(finite, a, jnp.full_like(a, jnp.nan)), answer)
+        return jax.tree.map(lambda a: nan_where(~finite, a), answer)
 
     return jnp.vectorize(lane, signature=f"(d)->{shape}")(point)
