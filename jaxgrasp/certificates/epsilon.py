@@ -71,13 +71,12 @@ def prove_epsilon(grasp, answer, tolerance: float | None = None) -> Proof:
 
 def _claim(answer, batch: tuple[int, ...], known: Rebuilt, m: int) -> Claim:
     said, (k, n) = Fields(answer, batch), known.scale.shape[1:]
-    shapes = np.shape(getattr(answer, "forces", None)), np.shape(getattr(answer, "facets", None))
-    if any(len(shape) != len(batch) + 2 for shape in shapes) or getattr(answer, "norm", None) not in NORMS:
-        raise Malformed("forces, facets or norm")
-    facets = np.asarray(answer.facets)
-    if facets.dtype.kind not in "iu" or facets.shape != (*batch, shapes[1][-2], m):
+    forces, facets, norm = said.array("forces"), said.array("facets"), getattr(answer, "norm", None)
+    if forces.ndim != len(batch) + 2 or not isinstance(norm, str) or norm not in NORMS:
+        raise Malformed("forces or norm")
+    if facets.dtype.kind not in "iu" or facets.ndim != len(batch) + 2 or facets.shape[-1] != m:
         raise Malformed("facets")
-    vertices = shapes[0][-2]
+    vertices = forces.shape[-2]
     return Claim(
         said.numbers("status"),
         said.numbers("lower"),
@@ -85,9 +84,9 @@ def _claim(answer, batch: tuple[int, ...], known: Rebuilt, m: int) -> Claim:
         said.numbers("torque_scale"),
         said.numbers("direction", m),
         said.numbers("touching", k * n).reshape(-1, k, n),
-        said.numbers("forces", vertices, k * n).reshape(-1, vertices, k, n),
-        facets.reshape(-1, shapes[1][-2], m),
-        answer.norm,
+        said.numbers("forces", vertices, k * n).reshape(len(known.valid), vertices, k, n),
+        facets.reshape(len(known.valid), facets.shape[-2], m).astype(np.int64),
+        norm,
     )
 
 

@@ -37,7 +37,7 @@ def escape_twist(grasp: ExactGrasp, lane: Scaled, xi: np.ndarray) -> Twist | Non
         if still is not None and grasp.escapes(still):
             return still
     inwards = _inwards(lane, x, unseen, size)
-    for step in STEPS:
+    for step in STEPS if np.isfinite(inwards).all() else ():
         nudged = twist_of(grasp, _physical(lane, grasp.dimension, xi + step * inwards))
         if grasp.escapes(nudged):
             return nudged

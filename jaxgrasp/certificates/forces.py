@@ -25,7 +25,7 @@ from .criteria import Asked, Multipliers, cost, cost_change, lower_bound, robust
 from .force_problem import ForceProblem, force_problem
 from .interior import edges_of, exact_forces
 from .proof import LEVELS, Proof
-from .reading import Fields
+from .reading import Fields, Malformed
 from .rebuilt import EPS, scaled_force, scaled_twist
 from .separation import prove_separation
 
@@ -73,7 +73,9 @@ def prove_forces(grasp, answer, problem, tolerance: float | None = None) -> Proo
         posed = force_problem(grasp, problem)
         asked, claim = posed.asked, _claim(posed, answer)
         eps = float(np.finfo(np.dtype(grasp.position.dtype)).eps)
-        smoothing = float(getattr(answer, "smoothing", 0.0) or 0.0)
+        smoothing = getattr(answer, "smoothing", 0.0)
+        if not isinstance(smoothing, int | float) or not 0 <= smoothing < np.inf:
+            raise Malformed("smoothing")
         level, shown = _held(posed, claim, eps, CLOSE if tolerance is None else tolerance, smoothing)
         lost = asked.valid & (claim.status == INFEASIBLE) & (claim.lower == np.inf) & (claim.upper == np.inf)
         lost &= (claim.s == 0).all((-1, -2))

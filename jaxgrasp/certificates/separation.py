@@ -30,6 +30,9 @@ def prove_separation(
 
     wrench  (N, m) the load as given, in the units of the caller
     """
+    # A proof may be scaled by any positive number: to size 1, so that nothing over- or underflows.
+    largest = np.max(np.abs(np.concatenate([twist, rates], -1)), -1, keepdims=True)
+    twist, rates = twist / largest, rates / largest
     shown = _separates(asked, twist, rates)
     level, distance = np.where(lanes & shown, 2, 0), np.zeros(len(lanes))
     for lane in np.flatnonzero(lanes & ~shown & np.isfinite(twist).all(-1)):
@@ -41,8 +44,6 @@ def _separates(asked: Asked, twist: np.ndarray, rates: np.ndarray) -> np.ndarray
     """In floating point, with bounds of all rounding."""
     known, jacobian = asked.known, asked.scaled_jacobian()
     n, joints = jacobian.shape[2], rates.shape[-1]
-    largest = np.max(np.abs(np.concatenate([twist, rates], -1)), -1, keepdims=True)
-    twist, rates = twist / largest, rates / largest
     x = np.einsum("lkij,li->lkj", known.blocks, twist) + np.einsum("lkcj,lj->lkc", jacobian, rates)
     speed, size = np.linalg.norm(twist, axis=-1), np.linalg.norm(asked.load, axis=-1)
     blur = np.linalg.norm(known.blocks, axis=(-2, -1)) * speed[:, None]
