@@ -41,6 +41,10 @@ class ContactFile:
             first = next(batches(self.path, file, 1, list(REQUIRED)), None)
             if first is None:
                 raise UserError(f"{self.path} is damaged: it has fewer rows than it says")
+        if len(self.metadata.get("centre_of_mass") or (0, 0, 0)) != 3:
+            raise UserError(
+                f"{self.path}: the metadata under the key 'jaxgrasp' are damaged: the centre of mass is not in space"
+            )
         self.fingers = self._vectors(first, "position").shape[1]
         if self.fingers < 1:
             raise UserError(f"{self.path}: the column position holds no contacts in its first row")
