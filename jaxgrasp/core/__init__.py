@@ -4,6 +4,7 @@ from .answer import Answer
 from .arrays import Array, ArrayLike, Bool, Float, Index, Int, as_array, placed, real_array, uniform, widened
 from .broadcast import spread
 from .errors import UserError
+from .files import check_file, open_archive, open_file, read_file, read_member
 from .geometry import (
     applied,
     contact_frame,
@@ -62,6 +63,7 @@ __all__ = [
     "as_array",
     "balance_tolerance",
     "bracket_width",
+    "check_file",
     "complementary_ratio",
     "contact_frame",
     "cross",
@@ -77,12 +79,16 @@ __all__ = [
     "largest_response",
     "normalize",
     "normalize_components",
+    "open_archive",
+    "open_file",
     "orientation_matrix",
     "part_of",
     "pivot_tolerance",
     "placed",
     "proven_limit",
     "rank_tolerance",
+    "read_file",
+    "read_member",
     "real_array",
     "renamed",
     "rotate",
