@@ -64,22 +64,12 @@ def clean(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     faces = _without_slivers(vertices, faces)
     counts.append(len(faces))
     faces = _without_opposites(vertices, faces)
-    degenerate, double = (
-        counts[0] - counts[1] + counts[2] - counts[3],
-        counts[1] - counts[2] + counts[3] - len(faces),
-    )
-    kinds = (
-        (double, "duplicate faces"),
-        (degenerate, "faces without area"),
-        (unused, "vertices without a face"),
-    )
-    dropped = ", ".join(f"{count} {kind}" for count, kind in kinds if count)
+    counts.append(len(faces))
+    repeated, double, thin, opposite = -np.diff(counts)
+    kinds = ((double + opposite, "faces that were there twice"), (repeated + thin, "faces without area"))
+    dropped = ", ".join(f"{n} {kind}" for n, kind in (*kinds, (unused, "vertices without a face")) if n)
     kept, faces = np.unique(faces, return_inverse=True)
-    return (
-        vertices[kept],
-        faces.reshape(-1, 3),
-        [f"dropped: {dropped}; the mesh may be worth a look"] * bool(dropped),
-    )
+    return vertices[kept], faces.reshape(-1, 3), [f"the mesh lost {dropped}"] * bool(dropped)
 
 
 def _merge(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

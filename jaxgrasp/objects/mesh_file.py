@@ -11,7 +11,6 @@ import gzip
 import importlib.util
 import io
 import os
-import stat
 import subprocess
 import sys
 import zlib
@@ -19,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core import UserError
+from ..core import UserError, open_archive, read_file
 from . import mesh_parser
-from .mesh_parser import ARCHIVES, MOST_BYTES, TOO_LARGE
+from .mesh_parser import ARCHIVES, MOST_BYTES
 
 __all__ = ["mesh_bytes", "mesh_triangles"]
 
@@ -38,10 +37,13 @@ OPTIONAL = {
     "zae": ("collada",),
 }
 PACKAGES = {"PIL": "pillow", "openctm": "python-openctm", "collada": "pycollada"}
+ZIPPED = ("zip", "3mf", "3dxml", "zae")
+MOST_MEMBERS = 10_000
 POINTS = ("xyz", "pcd", "pts", "asc", "las", "laz", "e57")
 DRAWINGS = ("dxf", "svg")
 PACKED = {"gz": gzip.open, "bz2": bz2.open}
 SHORT = {"tgz": "tar.gz", "tbz2": "tar.bz2"}
+FARTHEST = 1e30  # of coordinates in the file's unit: their fifth powers are numbers
 SECONDS = 4  # of processor time for the parser,
 BYTES_A_SECOND = 32 << 20  # and one more for so many bytes
 PATIENCE = 2  # seconds of the clock for one of these, where others work on the machine
@@ -50,21 +52,10 @@ PATIENCE = 2  # seconds of the clock for one of these, where others work on the 
 def mesh_bytes(path: Path) -> bytes:
     """The file's bytes. UserError for what is not there, no ordinary file, or too large."""
     try:
-        status = path.stat()
-        if stat.S_ISDIR(status.st_mode):
-            raise UserError(f"{path} is a directory; name a mesh file in it")
-        if not stat.S_ISREG(status.st_mode):
-            raise UserError(f"{path} is a pipe or a device, no ordinary file; save the mesh to one first")
-        with path.open("rb") as stream:
-            data = stream.read(MOST_BYTES + 1)
-    except FileNotFoundError as error:
-        raise UserError(f"{path}: no such file{_meant(path)}") from error
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(f"{str(path)!r} cannot be read: {reason}") from error
-    if len(data) > MOST_BYTES:
-        raise UserError(f"{path} is larger than {MOST_BYTES >> 20} MiB; simplify the mesh first")
-    return data
+        return read_file(path, MOST_BYTES)
+    except UserError as error:
+        meant = _meant(path) if str(error).endswith("no such file") else ""
+        raise UserError(f"{error}{meant}") from error
 
 
 def mesh_triangles(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
@@ -75,10 +66,14 @@ def mesh_triangles(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
         data = _unpack(path, data, names.pop())
     kind = names[-1] if names else ""
     _known(path, kind)
+    if kind in ZIPPED:
+        open_archive(path, io.BytesIO(data), MOST_BYTES, MOST_MEMBERS)
     found = _plain_stl(data) if kind == "stl" else None
     vertices, faces = found or _parse(path, data, kind)
-    if not np.isfinite(vertices[faces]).all():
-        raise UserError(f"{path} holds NaN or infinite vertex coordinates; repair the mesh first")
+    if not (np.abs(vertices[faces]) <= FARTHEST).all():
+        raise UserError(
+            f"{path} holds NaN or infinite vertex coordinates, or some above {FARTHEST:g}; repair it first"
+        )
     return vertices, faces
 
 
@@ -109,7 +104,9 @@ def _unpack(path: Path, data: bytes, packing: str) -> bytes:
     except (OSError, EOFError, zlib.error) as error:
         raise UserError(f"{path} is not a complete {packing[:2]}ip file: {error}") from error
     if len(unpacked) > MOST_BYTES:
-        raise UserError(f"{path} cannot be read: {TOO_LARGE}")
+        raise UserError(
+            f"{path} unpacks to more than {MOST_BYTES >> 20} MiB; unpack and simplify the mesh first"
+        )
     return unpacked
 
 

@@ -72,9 +72,9 @@ def load_mesh(
     path = Path(source)
     data = mesh_bytes(path)
     vertices, faces = mesh_triangles(path, data)
-    if not len(faces) or not double_areas(vertices[faces]).any():
-        raise UserError(f"{path} has a surface of zero area: every face is degenerate")
     vertices, faces, dropped = clean(vertices, faces)
+    if not double_areas(vertices[faces]).any():
+        raise UserError(f"{path} has a surface of zero area: every face is degenerate")
     vertices, faces, changed = solid(vertices, faces)
     mesh = trimesh.Trimesh(METRES_PER[unit] * vertices, faces, process=False)
     warnings = dropped + changed
@@ -99,10 +99,11 @@ def _centre_of_mass(mesh: trimesh.Trimesh, watertight: bool) -> tuple[np.ndarray
     """Centre of mass in m, and whether it is the volume's. Integrated about the middle in units of the size."""
     middle, size = mesh.bounds.mean(axis=0), float(mesh.extents.max())
     triangles = (np.asarray(mesh.triangles) - middle) / size
-    if watertight:
+    if watertight and signed_volume(triangles) > 1e-9 * float(
+        np.prod(np.maximum(mesh.extents / size, 1e-12))
+    ):
         properties = trimesh.triangles.mass_properties(triangles, skip_inertia=True)
-        if properties.volume > 1e-9 * float(np.prod(np.maximum(mesh.extents / size, 1e-12))):
-            return size * np.asarray(properties.center_mass) + middle, True
+        return size * np.asarray(properties.center_mass) + middle, True
     return size * np.average(triangles.mean(axis=1), axis=0, weights=double_areas(triangles)) + middle, False
 
 

@@ -82,9 +82,9 @@ def solid(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     Faces keep their order where nothing was joined. Parts share no vertices, so that those that touch at an edge or a
     point are each closed.
     """
-    parts = _parts(vertices, faces)
+    found = _parts(vertices, faces)
+    parts, words = _without_walls(found, float(np.ptp(vertices, axis=0).max()))
     closed = [part for part in parts if part.closed]
-    words = []
     owner: list[Part | None] = [None] * len(closed)
     groups = [[i] for i in range(len(closed))]
     if len(closed) > MOST_PARTS:
@@ -96,7 +96,7 @@ def solid(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
         owner = _owners(closed, near)
         label = connected_components(csr_matrix(near), directed=False)[1]
         groups = [np.flatnonzero(label == i).tolist() for i in range(label.max() + 1)]
-    words = _turned_words(closed, owner, len(parts)) + words
+    words += _turned_words(closed, owner, len(found))
 
     pieces = [(part.compact(), part.rows) for part in parts if not part.closed]
     last = len(faces)
@@ -116,6 +116,17 @@ def solid(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     )
     order = np.argsort(np.concatenate([rows for _, rows in pieces]))
     return np.concatenate([corners for (corners, _), _ in pieces]), all_faces[order], words
+
+
+def _without_walls(parts: list[Part], size: float) -> tuple[list[Part], list[str]]:
+    """Without closed parts that enclose nothing: walls between parts that touch."""
+    kept = [part for part in parts if not part.closed or abs(part.volume) > NEAR * size * part.area]
+    if len(kept) in (0, len(parts)):
+        return parts, []
+    lost = sum(len(part.faces) for part in parts) - sum(len(part.faces) for part in kept)
+    return kept, [
+        f"the mesh lost {lost} faces that have no volume on either side: walls between parts that touch"
+    ]
 
 
 def _boxes_touch(parts: list[Part]) -> np.ndarray:
@@ -203,7 +214,7 @@ def _turned_words(closed: list[Part], owner: list[Part | None], count: int) -> l
     if not turned:
         return []
     named = ", ".join(str(number) for number in turned[:NAMED]) + ", ..." * (len(turned) > NAMED)
-    where = f" of part {named}" if count > 1 else ""
+    where = f" of part{'s' * (len(turned) > 1)} {named}" if count > 1 else ""
     return [
         f"some faces{where} pointed inwards; they were turned so that all normals point out of the volume"
     ]
