@@ -161,11 +161,13 @@ def _parse(path: Path, data: bytes, kind: str) -> tuple[np.ndarray, np.ndarray]:
     except subprocess.TimeoutExpired as error:
         raise UserError(_too_long(path)) from error
     if done.returncode == 3:
-        raise UserError(f"{path} cannot be read as {kind}: {done.stderr.decode().splitlines()[-1]}")
+        raise UserError(
+            f"{path} cannot be read as {kind}: {done.stderr.decode(errors='replace').splitlines()[-1]}"
+        )
     if done.returncode < 0:
         raise UserError(_too_long(path))
     if done.returncode:
-        raise RuntimeError(f"the parser of meshes does not run: {done.stderr.decode()}")
+        raise RuntimeError(f"the parser of meshes does not run: {done.stderr.decode(errors='replace')}")
     stream = io.BytesIO(done.stdout)
     return np.load(stream, allow_pickle=False), np.load(stream, allow_pickle=False)
 

@@ -9,6 +9,7 @@ package nor JAX, opens no file but those that lie beside PATH, and no connection
 from __future__ import annotations
 
 import io
+import json
 import sys
 import tarfile
 import warnings
@@ -35,8 +36,10 @@ def members(kind: str, data: bytes) -> dict[str, bytes]:
         return {name: stream.read() for name, stream in inside if stream is not None}
 
 
-def refuse_lying_counts(kind: str, data: bytes) -> None:
-    """Counts in a binary header that the bytes after it cannot hold."""
+def refuse_damaged(kind: str, data: bytes) -> None:
+    """Damage of which trimesh says something else: a count of faces that the file cannot hold, JSON that is none."""
+    if kind == "gltf":
+        json.loads(data)
     if kind == "stl" and b"\0" in data:
         count, room = int.from_bytes(data[80:84], "little"), (len(data) - 84) // 50
         if len(data) < 84 or len(data) != 84 + 50 * count:
@@ -47,10 +50,13 @@ def meshes(kind: str, data: bytes, resolver) -> list:
     """All triangle meshes of the file, placed as its scene says."""
     import trimesh
 
-    refuse_lying_counts(kind, data)
+    refuse_damaged(kind, data)
     options = {"allow_remote": False, "skip_materials": True, "process": False}
     scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, **options)
-    return [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    found = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    if any(part.vertices.shape[1:] != (3,) or part.faces.shape[1:] != (3,) for part in found):
+        raise Unreadable("it is damaged: a vertex has three coordinates, and a face three corners or more")
+    return found
 
 
 def triangles(kind: str, data: bytes, path: str, kinds: tuple[str, ...] = ()):
@@ -102,7 +108,8 @@ def reason(error: BaseException) -> str:
     if isinstance(error, ImportError | UnicodeError):  # trimesh asks for a package that guesses encodings
         return "it is damaged, or it is a file of another kind under this name"
     text = " ".join(str(error).split()) or type(error).__name__
-    return f"it is damaged, or it is a file of another kind under this name ({text[:160]})"
+    shown = "".join(character if character.isprintable() else "?" for character in text[:160])
+    return f"it is damaged, or it is a file of another kind under this name ({shown})"
 
 
 def limit(seconds: int) -> None:

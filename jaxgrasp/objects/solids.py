@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain, combinations
 from typing import Any
 
 import numpy as np
@@ -184,24 +185,27 @@ def _joined(
         return None, []
     mesh = union.to_mesh64()
     result = np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts)
-    return result, [] if apart else [_met_words(solids)]
+    cavities = [part for part, its in zip(parts, owner, strict=True) if its is not None]
+    return result, [] if apart else [_met_words(solids, cavities)]
 
 
-def _met_words(parts: list[Part]) -> str:
-    """Which of the parts, all solid, have surface in each other."""
+def _met_words(*kinds: list[Part]) -> str:
+    """Which of the solid parts, and which of the cavities, have surface in each other."""
     met = []
-    for second, b in enumerate(parts):
-        for a in parts[:second]:
-            common, smaller = (a.body ^ b.body).volume(), min((a, b), key=lambda part: part.volume)
-            larger = b if smaller is a else a
-            if common > (1 - 1e-6) * smaller.volume:
-                met.append(f"part {smaller.number} lies in part {larger.number} and is no cavity")
-            elif common > NEAR * smaller.volume:
-                met.append(f"parts {a.number} and {b.number} overlap")
-            elif (a.body + b.body).surface_area() < (1 - NEAR) * (a.area + b.area):
-                met.append(f"parts {a.number} and {b.number} touch")
-            if len(met) > NAMED:
-                return f"{', '.join(met[:NAMED])} and more; {JOINED}"
+    for a, b in chain.from_iterable(combinations(parts, 2) for parts in kinds):
+        if (np.maximum(a.box[0], b.box[0]) > np.minimum(a.box[1], b.box[1])).any():
+            continue
+        common, smaller = (a.body ^ b.body).volume(), min((a, b), key=lambda part: part.volume)
+        if common > (1 - 1e-6) * smaller.volume:
+            met.append(
+                f"part {smaller.number} lies in part {(b if smaller is a else a).number} and is no cavity"
+            )
+        elif common > NEAR * smaller.volume:
+            met.append(f"parts {a.number} and {b.number} overlap")
+        elif (a.body + b.body).surface_area() < (1 - NEAR) * (a.area + b.area):
+            met.append(f"parts {a.number} and {b.number} touch")
+        if len(met) > NAMED:
+            return f"{', '.join(met[:NAMED])} and more; {JOINED}"
     return f"{', '.join(met) or 'parts meet'}; {JOINED}"
 
 
