@@ -19,7 +19,8 @@ from ..core import Float, UserError
 from .builtin import OBJECTS, make_object
 from .cleaning import clean, double_areas
 from .mesh_file import mesh_bytes, mesh_triangles
-from .solids import signed_volume, solid
+from .parts import signed_volumes
+from .solids import solid
 
 __all__ = ["METRES_PER", "Body", "load_mesh"]
 
@@ -78,7 +79,7 @@ def load_mesh(
     vertices, faces, changed = solid(vertices, faces)
     mesh = trimesh.Trimesh(METRES_PER[unit] * vertices, faces, process=False)
     warnings = dropped + changed
-    if not mesh.is_watertight and signed_volume(vertices[faces]) < 0:
+    if not mesh.is_watertight and _volume(vertices[faces]) < 0:
         warnings.append("the faces seem to point inwards: contact normals may be reversed; check the mesh")
     warnings += _suspect_unit(mesh, unit)
     return _body(mesh, name, hashlib.sha256(data).hexdigest(), unit, com, warnings)
@@ -95,13 +96,15 @@ def _suspect_unit(mesh: trimesh.Trimesh, unit: str) -> list[str]:
     ]
 
 
+def _volume(triangles: np.ndarray) -> float:
+    return float(signed_volumes(triangles, np.zeros(len(triangles), np.intp))[0])
+
+
 def _centre_of_mass(mesh: trimesh.Trimesh, watertight: bool) -> tuple[np.ndarray, bool]:
     """Centre of mass in m, and whether it is the volume's. Integrated about the middle in units of the size."""
     middle, size = mesh.bounds.mean(axis=0), float(mesh.extents.max())
     triangles = (np.asarray(mesh.triangles) - middle) / size
-    if watertight and signed_volume(triangles) > 1e-9 * float(
-        np.prod(np.maximum(mesh.extents / size, 1e-12))
-    ):
+    if watertight and _volume(triangles) > 1e-9 * float(np.prod(np.maximum(mesh.extents / size, 1e-12))):
         properties = trimesh.triangles.mass_properties(triangles, skip_inertia=True)
         return size * np.asarray(properties.center_mass) + middle, True
     return size * np.average(triangles.mean(axis=1), axis=0, weights=double_areas(triangles)) + middle, False

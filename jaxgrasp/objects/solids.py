@@ -1,4 +1,4 @@
-"""What is solid: closed parts turned outwards, cavities kept, parts that overlap or touch joined.
+"""What is solid: cavities kept, parts that overlap or touch joined, walls between them dropped.
 
 ``body = union_i (part_i minus the cavities in part_i)``: a part is a connected closed surface. Seen from the outermost
 part around it, one whose faces point the other way, and whose smallest container is solid, is a cavity. All others are
@@ -16,65 +16,58 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from .cleaning import double_areas, edge_numbers
-from .edges import around_edges
+from .cleaning import edge_numbers
+from .parts import Parts, find_parts
 
-__all__ = ["signed_volume", "solid"]
+__all__ = ["solid"]
 
 NEAR = 1e-9  # of the mesh's size: boxes nearer than this touch; of volumes and areas: equal
+WHOLE = 1 - 1e-6  # of a part's volume in another: it lies inside
 MOST_PARTS = 1000  # that are looked at for what overlaps
 NAMED = 3  # parts or pairs of them in one sentence
 JOINED = "they were joined, and the surface inside was dropped"
 
 
-@dataclass(frozen=True)
-class Part:
-    """A connected surface of its own: faces (f, 3) into ``vertices`` (v, 3), outwards; ``number`` counts from 1.
+@dataclass(frozen=True, eq=False)
+class Closed:
+    """A closed part: its own vertices (v, 3) and faces (f, 3), outwards.
 
-    rows      (f,) of its faces in the mesh
-    closed    whether it encloses a volume; an open part keeps the file's winding
-    inwards   share of its faces that pointed inwards in the file
+    number   in the file, from 1
+    inwards  whether most of its faces pointed inwards there
     """
 
     number: int
     vertices: np.ndarray
     faces: np.ndarray
-    rows: np.ndarray
-    closed: bool
-    inwards: float
+    inwards: bool
+    volume: float
+    area: float
+
+    @classmethod
+    def of(cls, vertices: np.ndarray, parts: Parts, part: int) -> Closed:
+        """Part number ``part``."""
+        used, faces = np.unique(parts.faces[parts.label == part], return_inverse=True)
+        volume, area = float(parts.volume[part]), float(parts.area[part])
+        return cls(
+            part + 1, vertices[used], faces.reshape(-1, 3), bool(parts.inwards[part] > 0.5), volume, area
+        )
 
     @cached_property
     def box(self) -> np.ndarray:
         """(2, 3): lowest and highest coordinates."""
-        corners = self.vertices[self.faces].reshape(-1, 3)
-        return np.stack([corners.min(axis=0), corners.max(axis=0)])
-
-    @cached_property
-    def volume(self) -> float:
-        """Inside the surface."""
-        return signed_volume(self.vertices[self.faces])
-
-    @cached_property
-    def area(self) -> float:
-        """Of the surface."""
-        return float(double_areas(self.vertices[self.faces]).sum()) / 2
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     @cached_property
     def body(self) -> Any:
         """The part as the union's own type."""
         from manifold3d import Manifold, Mesh64
 
-        return Manifold(Mesh64(*self.compact()))
+        return Manifold(Mesh64(self.vertices, self.faces.astype(np.uint64)))
 
     @cached_property
     def pinched(self) -> bool:
         """Whether it meets itself at an edge."""
         return bool((np.bincount(edge_numbers(self.faces)[0].ravel()) > 2).any())
-
-    def compact(self) -> tuple[np.ndarray, np.ndarray]:
-        """Its own vertices and its faces into these."""
-        used, faces = np.unique(self.faces, return_inverse=True)
-        return self.vertices[used], faces.reshape(-1, 3).astype(np.uint64)
 
 
 def solid(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
@@ -83,66 +76,63 @@ def solid(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     Faces keep their order where nothing was joined. Parts share no vertices, so that those that touch at an edge or a
     point are each closed.
     """
-    found = _parts(vertices, faces)
-    parts, words = _without_walls(found, float(np.ptp(vertices, axis=0).max()))
-    closed = [part for part in parts if part.closed]
-    owner: list[Part | None] = [None] * len(closed)
-    groups = [[i] for i in range(len(closed))]
-    if len(closed) > MOST_PARTS:
+    parts, words = _without_walls(find_parts(vertices, faces), float(np.ptp(vertices, axis=0).max()))
+    numbers, count = np.flatnonzero(parts.closed), len(parts.closed)
+    cavity, replaced = np.zeros(count, bool), np.zeros(count, bool)
+    joined, met = [], []
+    if len(numbers) > MOST_PARTS:
         words.append(
-            f"the mesh has {len(closed)} closed parts: where they overlap, their surface inside is not dropped"
+            f"the mesh has {len(numbers)} closed parts, too many to look for surface that lies inside another"
         )
-    elif len(closed) > 1:
+    elif len(numbers):
+        closed = [Closed.of(vertices, parts, i) for i in numbers]
         near = _boxes_touch(closed)
         owner = _owners(closed, near)
-        label = connected_components(csr_matrix(near), directed=False)[1]
-        groups = [np.flatnonzero(label == i).tolist() for i in range(label.max() + 1)]
-    words += _turned_words(closed, owner, len(found))
-
-    pieces = [(part.compact(), part.rows) for part in parts if not part.closed]
-    last = len(faces)
-    for group in groups:
-        joined, said = _joined([closed[i] for i in group], [owner[i] for i in group])
-        words += said
-        if joined is not None:
-            pieces.append((joined, np.arange(last, last + len(joined[1]))))
-            last += len(joined[1])
-            continue
-        for i in group:
-            corners, own = closed[i].compact()
-            pieces.append(((corners, own if owner[i] is None else own[:, ::-1]), closed[i].rows))
-    offsets = np.cumsum([0] + [len(corners) for (corners, _), _ in pieces[:-1]])
-    all_faces = np.concatenate(
-        [own.astype(np.int64) + o for ((_, own), _), o in zip(pieces, offsets, strict=True)]
+        cavity[numbers] = [its is not None for its in owner]
+        group = connected_components(csr_matrix(near), directed=False)[1]
+        for members in (np.flatnonzero(group == i) for i in range(group.max() + 1)):
+            union, said = _joined([closed[i] for i in members], [owner[i] for i in members])
+            joined += [union] * (union is not None)
+            replaced[numbers[members]] = union is not None
+            met += said
+    words += _turned_words(
+        np.flatnonzero(parts.closed & np.where(cavity, parts.inwards < 1, parts.inwards > 0)), count
     )
-    order = np.argsort(np.concatenate([rows for _, rows in pieces]))
-    return np.concatenate([corners for (corners, _), _ in pieces]), all_faces[order], words
+
+    rest = parts.without(replaced)
+    kept = np.where(cavity[rest.label, None], rest.faces[:, ::-1], rest.faces)
+    used, own = np.unique(rest.label[:, None] * len(vertices) + kept, return_inverse=True)
+    pieces = [(vertices[used % len(vertices)], own.reshape(-1, 3)), *joined]
+    offsets = np.cumsum([0] + [len(points) for points, _ in pieces[:-1]])
+    all_faces = np.concatenate(
+        [own.astype(np.int64) + start for (_, own), start in zip(pieces, offsets, strict=True)]
+    )
+    return np.concatenate([points for points, _ in pieces]), all_faces, words + met
 
 
-def _without_walls(parts: list[Part], size: float) -> tuple[list[Part], list[str]]:
+def _without_walls(parts: Parts, size: float) -> tuple[Parts, list[str]]:
     """Without closed parts that enclose nothing: walls between parts that touch."""
-    kept = [part for part in parts if not part.closed or abs(part.volume) > NEAR * size * part.area]
-    if len(kept) in (0, len(parts)):
+    empty = parts.closed & (parts.volume <= NEAR * size * parts.area)
+    if not empty.any() or empty.all():
         return parts, []
-    lost = sum(len(part.faces) for part in parts) - sum(len(part.faces) for part in kept)
-    return kept, [
-        f"the mesh lost {lost} faces that have no volume on either side: walls between parts that touch"
-    ]
+    lost = int(empty[parts.label].sum())
+    said = f"the mesh lost {lost} faces with no volume on either side: walls between parts that touch"
+    return parts.without(empty), [said]
 
 
-def _boxes_touch(parts: list[Part]) -> np.ndarray:
+def _boxes_touch(parts: list[Closed]) -> np.ndarray:
     """(n, n): whether the boxes of two parts have a point in common."""
     low, high = np.moveaxis(np.stack([part.box for part in parts]), 1, 0)
-    slack = NEAR * (high.max(axis=0) - low.min(axis=0)).max()
+    slack = NEAR * np.ptp(np.concatenate([low, high]), axis=0).max()
     return (low[:, None] <= high[None] + slack).all(axis=-1) & (low[None] <= high[:, None] + slack).all(
         axis=-1
     )
 
 
-def _owners(parts: list[Part], near: np.ndarray) -> list[Part | None]:
+def _owners(parts: list[Closed], near: np.ndarray) -> list[Closed | None]:
     """For each part the solid one that it is a cavity of, or None where it is solid itself."""
-    owner: list[Part | None] = [None] * len(parts)
-    if all(part.inwards <= 0.5 for part in parts):
+    owner: list[Closed | None] = [None] * len(parts)
+    if not any(part.inwards for part in parts):
         return owner
     by_size = sorted(range(len(parts)), key=lambda i: -parts[i].volume)
     root = list(range(len(parts)))
@@ -151,52 +141,53 @@ def _owners(parts: list[Part], near: np.ndarray) -> list[Part | None]:
         if not around:
             continue
         root[i], smallest = root[around[0]], around[-1]
-        if (parts[i].inwards > 0.5) != (parts[root[i]].inwards > 0.5) and owner[smallest] is None:
+        if parts[i].inwards != parts[root[i]].inwards and owner[smallest] is None:
             owner[i] = parts[smallest]
     return owner
 
 
-def _inside(inner: Part, outer: Part) -> bool:
+def _inside(inner: Closed, outer: Closed) -> bool:
     if (inner.box[0] < outer.box[0]).any() or (inner.box[1] > outer.box[1]).any():
         return False
-    return (inner.body ^ outer.body).volume() > (1 - 1e-6) * inner.volume
+    return (inner.body ^ outer.body).volume() > WHOLE * inner.volume
 
 
 def _joined(
-    parts: list[Part], owner: list[Part | None]
+    parts: list[Closed], owner: list[Closed | None]
 ) -> tuple[tuple[np.ndarray, np.ndarray] | None, list[str]]:
     """The union of solid parts without their cavities, and which of them met; None where none did."""
-    if len(parts) == 1 and not parts[0].pinched:
+    pinched = any(part.pinched for part in parts)
+    if len(parts) == 1 and not pinched:
         return None, []
     from manifold3d import Error, Manifold, OpType
 
-    def whole(part: Part) -> Any:
-        cavities = [other.body for other, its in zip(parts, owner, strict=True) if its is part]
-        return Manifold.batch_boolean([part.body, *cavities], OpType.Subtract)
+    def whole(part: Closed) -> Any:
+        its = [other.body for other, around in zip(parts, owner, strict=True) if around is part]
+        return Manifold.batch_boolean([part.body, *its], OpType.Subtract)
 
-    solids = [part for part, its in zip(parts, owner, strict=True) if its is None]
+    solids = [part for part, around in zip(parts, owner, strict=True) if around is None]
+    cavities = [part for part, around in zip(parts, owner, strict=True) if around is not None]
     union = Manifold.batch_boolean([whole(part) for part in solids], OpType.Add)
-    volume = sum(part.volume if its is None else -part.volume for part, its in zip(parts, owner, strict=True))
-    area = sum(part.area for part in parts)
     if union.status() != Error.NoError or union.is_empty():
         return None, []
+    volume = sum(part.volume for part in solids) - sum(part.volume for part in cavities)
+    area = sum(part.area for part in parts)
     apart = abs(union.volume() - volume) <= NEAR * volume and abs(union.surface_area() - area) <= NEAR * area
-    if apart and not any(part.pinched for part in parts):
+    if apart and not pinched:
         return None, []
     mesh = union.to_mesh64()
     result = np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts)
-    cavities = [part for part, its in zip(parts, owner, strict=True) if its is not None]
     return result, [] if apart else [_met_words(solids, cavities)]
 
 
-def _met_words(*kinds: list[Part]) -> str:
+def _met_words(*kinds: list[Closed]) -> str:
     """Which of the solid parts, and which of the cavities, have surface in each other."""
     met = []
     for a, b in chain.from_iterable(combinations(parts, 2) for parts in kinds):
         if (np.maximum(a.box[0], b.box[0]) > np.minimum(a.box[1], b.box[1])).any():
             continue
         common, smaller = (a.body ^ b.body).volume(), min((a, b), key=lambda part: part.volume)
-        if common > (1 - 1e-6) * smaller.volume:
+        if common > WHOLE * smaller.volume:
             met.append(
                 f"part {smaller.number} lies in part {(b if smaller is a else a).number} and is no cavity"
             )
@@ -209,83 +200,11 @@ def _met_words(*kinds: list[Part]) -> str:
     return f"{', '.join(met) or 'parts meet'}; {JOINED}"
 
 
-def _turned_words(closed: list[Part], owner: list[Part | None], count: int) -> list[str]:
-    turned = [
-        part.number
-        for part, its in zip(closed, owner, strict=True)
-        if (part.inwards > 0 if its is None else part.inwards < 1)
-    ]
-    if not turned:
+def _turned_words(turned: np.ndarray, count: int) -> list[str]:
+    if not len(turned):
         return []
-    named = ", ".join(str(number) for number in turned[:NAMED]) + ", ..." * (len(turned) > NAMED)
+    named = ", ".join(str(part + 1) for part in turned[:NAMED]) + ", ..." * (len(turned) > NAMED)
     where = f" of part{'s' * (len(turned) > 1)} {named}" if count > 1 else ""
     return [
         f"some faces{where} pointed inwards; they were turned so that all normals point out of the volume"
     ]
-
-
-def signed_volume(triangles: np.ndarray) -> float:
-    """``sum a . (b x c) / 6`` about their middle; positive where the faces look outwards."""
-    a, b, c = np.moveaxis(triangles - triangles.reshape(-1, 3).mean(axis=0), 1, 0)
-    return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6
-
-
-def _parts(vertices: np.ndarray, faces: np.ndarray) -> list[Part]:
-    """The connected parts of a clean mesh, in the order of their first faces, closed ones turned outwards.
-
-    Faces belong together across an edge that two share, and, where that closes no part, as ``around_edges`` says.
-    """
-    number, upwards = edge_numbers(faces)
-    order = np.argsort(number.ravel(), kind="stable")
-    pairs = order[np.bincount(number.ravel())[number.ravel()[order]] == 2].reshape(-1, 2)
-    label, flip = _wound_alike(pairs, upwards)
-    closed = _closes(label, number, upwards ^ flip[:, None])
-    if not closed.all():
-        more = around_edges(vertices, faces, number, upwards, np.flatnonzero(~closed[label]))
-        label, flip = _wound_alike(np.concatenate([pairs, more]), upwards)
-        closed = _closes(label, number, upwards ^ flip[:, None])
-    rows = np.split(np.argsort(label, kind="stable"), np.cumsum(np.bincount(label))[:-1])
-    by_first = sorted(range(len(rows)), key=lambda i: rows[i][0])
-    return [
-        _part(n, vertices, faces, rows[i], flip[rows[i]], bool(closed[i])) for n, i in enumerate(by_first, 1)
-    ]
-
-
-def _part(
-    number: int, vertices: np.ndarray, faces: np.ndarray, rows: np.ndarray, flip: np.ndarray, closed: bool
-) -> Part:
-    faces = faces[rows]
-    if not closed:
-        return Part(number, vertices, faces, rows, False, 0.0)
-    turned = np.where(flip[:, None], faces[:, ::-1], faces)
-    if signed_volume(vertices[turned]) < 0:
-        turned, flip = turned[:, ::-1], ~flip
-    return Part(number, vertices, turned, rows, True, float(flip.mean()))
-
-
-def _wound_alike(pairs: np.ndarray, upwards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The part of each face (f,), and whether it is turned so that all of a part agree with its first face.
-
-    pairs  (n, 2) sides of faces that belong together, 3 f + c; two nodes a face, as it is and turned
-    """
-    count, (one, other) = len(upwards), pairs.T // 3
-    agree = upwards.ravel()[pairs[:, 0]] != upwards.ravel()[pairs[:, 1]]
-    rows = np.concatenate([one, one + count])
-    columns = np.concatenate([np.where(agree, other, other + count), np.where(agree, other + count, other)])
-    graph = csr_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(2 * count, 2 * count))
-    node = connected_components(graph, directed=False)[1]
-    plain = csr_matrix((np.ones(len(one), bool), (one, other)), shape=(count, count))
-    label = connected_components(plain, directed=False)[1]
-    first = np.unique(label, return_index=True)[1]
-    return label, node[:count] != node[first][label]
-
-
-def _closes(label: np.ndarray, number: np.ndarray, upwards: np.ndarray) -> np.ndarray:
-    """Whether each part passes every edge as often upwards as downwards."""
-    edges = int(number.max()) + 1
-    key, at = np.unique((label[:, None] * edges + number).ravel(), return_inverse=True)
-    surplus = np.bincount(at.ravel(), np.where(upwards, 1, -1).ravel())
-    open_parts = key[surplus != 0] // edges
-    closed = np.ones(int(label.max()) + 1, bool)
-    closed[open_parts] = False
-    return closed
