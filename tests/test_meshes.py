@@ -64,6 +64,18 @@ def test_gzip(box_file, tmp_path):
     assert body.sha256 == hashlib.sha256(packed.read_bytes()).hexdigest()
 
 
+@pytest.mark.parametrize("scale", [1e-12, 1e-6, 1e6])
+def test_bodies_of_any_size(tmp_path, scale):
+    """Vertices are merged, and the volume is integrated, in proportion to the size."""
+    vertices, faces = builtin.box()
+    apart = scale * (vertices[faces].reshape(-1, 3) + (0.3, 0.2, -0.1))
+    body = objects.load_mesh(write_obj(tmp_path / "a.obj", apart, np.arange(36).reshape(-1, 3)))
+    assert body.watertight and len(body.mesh.vertices) == 8
+    assert body.centre_of_mass / scale == pytest.approx([0.3, 0.2, -0.1], rel=1e-12)
+    (warning,) = body.warnings
+    assert "--unit" in warning
+
+
 def test_a_scene_is_merged(tmp_path):
     scene = trimesh.Scene()
     scene.add_geometry(trimesh.creation.box(extents=(0.1, 0.1, 0.1)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..contacts import MODELS
-from ..core import UserError
+from ..core import UserError, open_file
 from ..formats import ContactFile, Contacts
 from ..objects import BLOCK, METRES_PER, OBJECTS, AntipodalSampler, SurfaceSampler, load_mesh
 from .outputs import default_output
@@ -205,9 +206,9 @@ def _is_parquet(source: str) -> bool:
     if path.suffix.lower() in (".parquet", ".pq"):
         return True
     try:
-        with path.open("rb") as stream:
+        with open_file(path, sys.maxsize) as stream:
             return stream.read(4) == b"PAR1"
-    except OSError:
+    except (UserError, OSError):
         return False
 
 

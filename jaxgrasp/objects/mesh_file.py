@@ -26,7 +26,7 @@ __all__ = ["mesh_bytes", "mesh_triangles"]
 
 KINDS = ("stl", "obj", "ply", "off", "glb", "gltf")
 # Kinds that trimesh reads with the help of others: modules, and what to install.
-OPTIONAL = {
+OPTIONAL: dict[str, tuple[str, ...]] = {
     "3mf": ("lxml", "networkx"),
     "3dxml": ("lxml", "networkx", "PIL"),
     "ctm": ("openctm",),
@@ -46,7 +46,7 @@ SHORT = {"tgz": "tar.gz", "tbz2": "tar.bz2"}
 FARTHEST = 1e30  # of coordinates in the file's unit: their fifth powers are numbers
 SECONDS = 4  # of processor time for the parser,
 BYTES_A_SECOND = 32 << 20  # and one more for so many bytes
-PATIENCE = 2  # seconds of the clock for one of these, where others work on the machine
+PATIENCE = 15  # seconds of the clock for one of these, where others work on the machine
 
 
 def mesh_bytes(path: Path) -> bytes:

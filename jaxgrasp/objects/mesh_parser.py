@@ -51,8 +51,14 @@ def meshes(kind: str, data: bytes, resolver) -> list:
     import trimesh
 
     refuse_damaged(kind, data)
-    options = {"allow_remote": False, "skip_materials": True, "process": False}
-    scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, **options)
+    scene = trimesh.load_scene(
+        io.BytesIO(data),
+        file_type=kind,
+        resolver=resolver,
+        allow_remote=False,
+        skip_materials=True,
+        process=False,
+    )
     found = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if any(part.vertices.shape[1:] != (3,) or part.faces.shape[1:] != (3,) for part in found):
         raise Unreadable("it is damaged: a vertex has three coordinates, and a face three corners or more")

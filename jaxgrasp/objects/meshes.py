@@ -53,7 +53,7 @@ class Body:
 def load_mesh(
     source: str | Path, *, unit: str = "m", com: Float[np.ndarray, " 3"] | Sequence[float] | None = None
 ) -> Body:
-    """The body ``source`` names: a built-in object, or a mesh file of any kind trimesh reads (also ``.gz``).
+    """The body ``source`` names: a built-in object, or a mesh file (also packed), see ``docs/screening.md``.
 
     unit  m, cm, mm or in: what one unit of the file's numbers is. Never guessed.
     com   (3,) centre of mass in m, mesh frame; by default computed from the mesh

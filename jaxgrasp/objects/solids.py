@@ -85,7 +85,7 @@ def solid(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
             f"the mesh has {len(numbers)} closed parts, too many to look for surface that lies inside another"
         )
     elif len(numbers):
-        closed = [Closed.of(vertices, parts, i) for i in numbers]
+        closed = [Closed.of(vertices, parts, int(i)) for i in numbers]
         near = _boxes_touch(closed)
         owner = _owners(closed, near)
         cavity[numbers] = [its is not None for its in owner]
