@@ -68,7 +68,7 @@ def test_gzip(box_file, tmp_path):
 def test_bodies_of_any_size(tmp_path, scale):
     """Vertices are merged, and the volume is integrated, in proportion to the size."""
     vertices, faces = builtin.box()
-    apart = scale * (vertices[faces].reshape(-1, 3) + (0.3, 0.2, -0.1))
+    apart = scale * (vertices[faces].reshape(-1, 3) + np.array([0.3, 0.2, -0.1]))
     body = objects.load_mesh(write_obj(tmp_path / "a.obj", apart, np.arange(36).reshape(-1, 3)))
     assert body.watertight and len(body.mesh.vertices) == 8
     assert body.centre_of_mass / scale == pytest.approx([0.3, 0.2, -0.1], rel=1e-12)
