@@ -95,9 +95,8 @@ def solid(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
             joined += [union] * (union is not None)
             replaced[numbers[members]] = union is not None
             met += said
-    words += _turned_words(
-        np.flatnonzero(parts.closed & np.where(cavity, parts.inwards < 1, parts.inwards > 0)), count
-    )
+    turned = parts.closed & np.where(cavity, parts.inwards < 1, parts.inwards > 0)
+    words += _turned_words(turned, cavity)
 
     rest = parts.without(replaced)
     kept = np.where(cavity[rest.label, None], rest.faces[:, ::-1], rest.faces)
@@ -200,11 +199,17 @@ def _met_words(*kinds: list[Closed]) -> str:
     return f"{', '.join(met) or 'parts meet'}; {JOINED}"
 
 
-def _turned_words(turned: np.ndarray, count: int) -> list[str]:
-    if not len(turned):
+def _turned_words(turned: np.ndarray, cavity: np.ndarray) -> list[str]:
+    if not turned.any():
         return []
-    named = ", ".join(str(part + 1) for part in turned[:NAMED]) + ", ..." * (len(turned) > NAMED)
-    where = f" of part{'s' * (len(turned) > 1)} {named}" if count > 1 else ""
+    where = f" of {_numbered(turned)}" if len(turned) > 1 else ""
+    kept = f"; {_numbered(turned & cavity)} stayed hollow" if (turned & cavity).any() else ""
     return [
-        f"some faces{where} pointed inwards; they were turned so that all normals point out of the volume"
+        f"some faces{where} pointed inwards; they were turned so that all normals point out of the volume{kept}"
     ]
+
+
+def _numbered(parts: np.ndarray) -> str:
+    numbers = [str(part + 1) for part in np.flatnonzero(parts)[: NAMED + 1]]
+    named = ", ".join(numbers[:NAMED]) + ", ..." * (len(numbers) > NAMED)
+    return f"part{'s' * (len(numbers) > 1)} {named}"
