@@ -38,7 +38,7 @@ ROOMS = (
 MAY_LOAD = {
     "motion": {"mujoco"},
     "placement": {"optax", "scipy"},
-    "objects": {"trimesh", "scipy"},
+    "objects": {"manifold3d", "scipy", "trimesh"},
     "surfaces": {"trimesh", "scipy"},
     "formats": {"pyarrow"},
     "report": {"matplotlib", "mpl_toolkits", "trimesh"},

@@ -222,6 +222,46 @@ def test_the_model_has_no_contacts_and_shows_the_mesh():
     np.testing.assert_allclose(data.qacc, [0, 0, -9.81, 0, 0, 0], atol=1e-12)
 
 
+SHAPES = {
+    "block": (0.4, 0.6, 0.8),
+    "plate": (1, 0.7, 1e-5),
+    "square plate": (1, 1, 1e-3),
+    "rod": (1, 1e-4, 1e-4),
+}
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e-4, 1e-3, 0.1, 1e3])
+@pytest.mark.parametrize("shape", list(SHAPES))
+def test_bodies_of_any_size(shape, scale):
+    """Exact principal moments, turned and far from the origin; or one line that says too small."""
+    import trimesh
+
+    sides = scale * np.array(SHAPES[shape])
+    mesh = trimesh.creation.box(sides)
+    turn = trimesh.transformations.rotation_matrix(0.7, (1, 2, 3))
+    mesh.apply_transform(turn)
+    mesh.apply_translation((3 * scale, -2 * scale, scale))
+    mass = 1000 * sides.prod()
+    squares = sides**2
+    moments = np.sort(mass / 12 * (squares.sum() - squares))
+    body = jg.RigidBody.from_mesh(mesh, density=1000)
+    assert float(body.mass) == pytest.approx(mass, rel=1e-9)
+    axes = turn[:3, :3]
+    inertia = axes @ np.diag(mass / 12 * (squares.sum() - squares)) @ axes.T
+    np.testing.assert_allclose(body.inertia, inertia, rtol=1e-8, atol=1e-9 * moments[2])
+    np.testing.assert_allclose(np.linalg.eigvalsh(body.inertia), moments, rtol=1e-7)
+    if min(mass, moments[0]) > 1e-15:
+        model = jg.motion.mujoco_model(body)
+        np.testing.assert_allclose(np.sort(model.body_inertia[1]), moments, rtol=1e-7)
+        plant = jg.motion.mujoco_plant(body)
+        np.testing.assert_allclose(np.sort(plant.model.body_inertia[1]), moments, rtol=1e-7)
+        return
+    for make in (jg.motion.mujoco_model, jg.motion.mujoco_plant):
+        with pytest.raises(ValueError, match="too small for MuJoCo: mass") as error:
+            make(body)
+        assert len(str(error.value).splitlines()) == 1
+
+
 def test_wrong_models_raise():
     body = jg.RigidBody(1.0, np.eye(3))
     with pytest.raises(ValueError, match="spatial bodies"):

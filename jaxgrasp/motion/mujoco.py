@@ -37,11 +37,12 @@ TEMPLATE = """
   <worldbody>
     <light pos="0.3 -0.3 1" dir="-0.3 0.3 -1"/>
     <body name="object"><freejoint/>
-      <inertial pos="0 0 0" mass="{mass!r}" fullinertia="{inertia}"/>{geometry}
+      <inertial pos="0 0 0" mass="{mass!r}" diaginertia="{moments}" quat="{axes}"/>{geometry}
     </body>
   </worldbody>
 </mujoco>
 """
+SMALLEST = 1e-15  # kg and kg m^2, MuJoCo's own bound
 STILL = 1.1e-8  # rad/s, just above MJX's own threshold
 GEOMETRY = '<geom name="object" type="mesh" mesh="object" contype="0" conaffinity="0" rgba=".75 .75 .8 1"/>'
 
@@ -77,7 +78,8 @@ def mujoco_model(
         raise ValueError(f"a MuJoCo model holds one body, this one has batch axes {body.batch_shape}")
     if not isinstance(timestep, int | float) or not 0 < timestep < 1:
         raise ValueError(f"timestep must be a positive number of seconds below 1, got {timestep!r}")
-    inertia = np.asarray(body.inertia, np.float64)
+    moments, axes = _principal(np.asarray(body.inertia, np.float64)[None])
+    _large_enough(float(body.mass), moments[0])
     g = np.asarray(gravity_vector(gravity, 3, body.dtype), np.float64)
     assets, asset = {}, ""
     if mesh is not None:
@@ -88,7 +90,8 @@ def mujoco_model(
         gravity=_words(g),
         asset=asset,
         mass=float(body.mass),
-        inertia=_words(inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]),
+        moments=_words(moments[0]),
+        axes=_words(axes[0]),
         geometry=GEOMETRY if mesh is not None else "",
     )
     return engine.MjModel.from_xml_string(xml, assets)
@@ -97,6 +100,15 @@ def mujoco_model(
 def _spatial(body: RigidBody) -> None:
     if not isinstance(body, RigidBody) or body.dimension != 3:
         raise ValueError("MuJoCo simulates spatial bodies: RigidBody(mass, inertia) with a 3 x 3 inertia")
+
+
+def _large_enough(mass: float, moments: np.ndarray) -> None:
+    """MuJoCo takes what is below ``SMALLEST`` for zero."""
+    if not min(mass, moments.min()) > SMALLEST:
+        raise ValueError(
+            f"too small for MuJoCo: mass {mass:.3g} kg and least principal moment {moments.min():.3g} kg m^2 must "
+            f"exceed {SMALLEST:g}; give them in smaller units, such as g and mm"
+        )
 
 
 def tangent(state: BodyState, change: Float[Array, "*batch 12"]) -> BodyState:
@@ -217,8 +229,11 @@ BATCHED = ("body_mass", "body_subtreemass", "body_inertia", "body_iquat")
 
 
 def _principal(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Principal moments (N, 3) and the quaternions (N, 4) of their axes."""
+    """Principal moments (N, 3), the largest at most the sum of the others, and the quaternions (N, 4) of their axes."""
     moments, axes = np.linalg.eigh(inertia)
+    moments[:, 2] = np.minimum(
+        moments[:, 2], moments[:, 0] + moments[:, 1]
+    )  # a flat body's is equal but for rounding
     axes[np.linalg.det(axes) < 0, :, 0] *= -1
     # Shepperd: from the largest of the four squares, so that nothing is divided by a small number
     a, trace = axes, np.trace(axes, axis1=-2, axis2=-1)
@@ -249,6 +264,7 @@ def mujoco_plant(
     model = mjx.put_model(host, impl="jax")
     moments, axes = _principal(np.asarray(body.inertia, np.float64).reshape(-1, 3, 3))
     mass = np.asarray(body.mass, np.float64).reshape(-1)
+    _large_enough(float(mass.min()), moments)
 
     def both(world: np.ndarray, object_: np.ndarray) -> Array:
         pair = np.stack([np.broadcast_to(world, object_.shape), object_], axis=1)

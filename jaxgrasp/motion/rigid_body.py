@@ -101,8 +101,16 @@ class RigidBody(eqx.Module):
             raise ValueError(
                 "the mesh encloses no volume: repair it, or give RigidBody(mass, inertia) yourself"
             )
-        scale = density if density is not None else mass / mesh.volume  # pyright: ignore[reportOptionalOperand]
-        return cls(scale * mesh.volume, scale / mesh.density * np.asarray(mesh.moment_inertia))
+        # In units of its size, since trimesh takes volumes below 1e-13 for none; along its length, width and height,
+        # since a thin body's least moment would drown in the rounding of the others.
+        size, unit = float(mesh.extents.max()), mesh.copy()
+        centred = (unit.vertices - mesh.bounds.mean(axis=0)) / size
+        axes = np.linalg.eigh(centred.T @ centred)[1]
+        axes[:, 0] *= np.linalg.det(axes)
+        unit.vertices, unit.density = centred @ axes, 1.0
+        if mass is None:
+            mass = density * unit.volume * size**3  # pyright: ignore[reportOptionalOperand]
+        return cls(mass, mass / unit.volume * size**2 * (axes @ np.asarray(unit.moment_inertia) @ axes.T))
 
     @property
     def dimension(self) -> int:

@@ -35,7 +35,7 @@ class Triangles:
     normal, area     (f, 3) outward, (f,) m^2
     smooth           (f, 3, 3) outward smooth normals at the corners
     sharp            (e, 2, 3) sharp edges, relative to ``middle``, m
-    closed           whether every edge joins two faces that agree about the outside
+    closed           whether every edge joins faces that agree about the outside, two or, where parts touch, more
 
     UserError for a mesh without faces or area, with NaN coordinates, without volume, or with its faces inwards.
     """
@@ -76,7 +76,7 @@ class Triangles:
         self.ends = np.stack(np.divmod(key, faces.max() + 1), axis=1)
         sides = np.bincount(edge[real], minlength=len(key))
         forward = np.bincount(edge[real & (start < end)], minlength=len(key))
-        self.closed = bool(((sides == 2) & (forward == 1))[sides > 0].all())
+        self.closed = bool((sides == 2 * forward).all())  # more than two sides where parts touch
         self.rim, self.manifold = sides == 1, sides == 2
         self.edge = edge.reshape(-1, 3)[good]
 
