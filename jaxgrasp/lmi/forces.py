@@ -30,7 +30,7 @@ from ..core import (
     wrench_dimension,
 )
 from ..forces import Criterion
-from .barrier import minimize
+from .primal_dual import minimize
 from .feasibility import feasibility
 from .friction import friction_lmi
 from .problem import LMIProblem, LogDetTerm, bracket_words

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from ..contacts import Grasp, is_grasp, null_space
 from ..core import Array, Bool, Float, rank_tolerance
-from .barrier import lmi_minimize
+from .primal_dual import lmi_minimize
 from .problem import LMIProblem, expect_shape
 
 __all__ = ["FrictionLMI", "friction_lmi", "is_grasp", "lmi_margin", "margin_lmi"]
