@@ -18,7 +18,7 @@ __all__ = ["lmi_minimize", "minimize"]
 MAX_STEPS = 100
 PATIENCE = 8  # steps without a better bound after which the method ends
 SHARE = 0.9  # of the way to the edge of the cones
-START = 10.0  # times the cost: the first multiplier; a small one makes the way back to the centre long
+START = 10.0  # times the slope of the cost: the first multiplier; a small one makes the way back to the centre long
 REFINEMENTS = 2  # of a direction
 POLISHINGS = 2  # of the multipliers that a bound is taken from
 
@@ -108,7 +108,7 @@ def _step(
     rest = slope + space.root.T @ image - _inner(space.matrices, iterate.Z)
     rows = jnp.arange(size)
     pushed = (rows >= problem.order) & (problem.weight > 0)  # rows that are kept at w
-    count = jnp.sum(~pushed)
+    count = jnp.sum(~pushed).astype(values.dtype)
 
     def direction(target: Array) -> tuple[Array, Array, Array]:
         D = 2 * target / (values + values[:, None])
@@ -129,7 +129,7 @@ def _step(
 
     def mean(S: Array, Z: Array) -> Array:
         """Of the complementarity of what is not kept at w."""
-        share = jnp.where(pushed, 0.0, 1.0)
+        share = (~pushed).astype(values.dtype)
         return jnp.sum(_symmetric(inverse @ (share[:, None] * R)) * _symmetric(S @ Z)) / count
 
     central = jnp.diag(values)
@@ -137,8 +137,9 @@ def _step(
     _, dS, dZ = direction(centre(jnp.zeros_like(mu)))
     primal, dual = lengths(dS, dZ)
     ratio = mean(central + primal * dS, central + dual * dZ) / mu
-    sigma = jnp.clip(ratio, 0.0, 1.0) ** 3
-    dx, dS, dZ = direction(centre(sigma * mu) - _symmetric(dS @ dZ))
+    shorter = jnp.minimum(primal, dual)
+    sigma = jnp.clip(ratio, 0.0, 1.0) ** jnp.maximum(1.0, 3 * shorter**2)
+    dx, dS, dZ = direction(centre(sigma * mu) - shorter**2 * _symmetric(dS @ dZ))
     primal, dual = lengths(dS, dZ)
     moved = _symmetric(iterate.Z + dual * inverse.T @ dZ @ inverse)
     return primal * (space.T @ dx), moved, dx, (Z, v)
@@ -186,7 +187,8 @@ def _minimize(given: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
             ended=~usable | is_ray(problem, x),
         )
 
-    size = jnp.linalg.norm(space.T.T @ given.cost)
+    slope = space.T.T @ (given.cost + problem.root.T @ (problem.root @ given.start))
+    size = jnp.linalg.norm(slope)
     Z = START * jnp.where(size > 0, size, 1.0) * jnp.eye(len(problem.constant), dtype=dtype)
     factor, upper = jnp.linalg.cholesky(problem.S(given.start)), upper_bound(problem, given.start)
     interior = _finite(factor, upper)  # else: not strictly feasible, or not numbers

@@ -18,7 +18,7 @@ __all__ = ["combination", "find_ray", "is_ray", "lower_bound", "surely_positive"
 
 def _sum_error(terms: Array, sizes: Array, dtype) -> Array:
     """Of a sum of ``terms`` products whose sizes add up to ``sizes``."""
-    return (terms + 2.0).astype(dtype) * unit_roundoff(dtype) * sizes
+    return (terms.astype(dtype) + 2.0) * unit_roundoff(dtype) * sizes
 
 
 def combination(x: Array, matrices: Array) -> tuple[Array, Array]:
