@@ -25,7 +25,7 @@ from ..core import (
 from .combined import combine
 from .primal_dual import lmi_minimize, minimize
 from .problem import LMIProblem, bracket_words, expect_shape, over_batch
-from .proofs import lower_bound, upper_bound
+from .proofs import find_ray, lower_bound, upper_bound
 
 __all__ = [
     "LMIFeasibility",
@@ -261,12 +261,29 @@ def sdp_minimize(
     batch = end.batch_shape
     phase = jax.tree.map(lambda x: jnp.broadcast_to(x, (*batch, *x.shape[feasible.ndim :])), phase)
     infeasible = phase.status == Status.INFEASIBLE.value
+    wanted = (end.status == Status.STALLED.value) & jnp.isneginf(end.lower)
+    found = over_batch(lambda one: _sequential_ray(*one), (u, constant, matrices, wanted), (1, 2, 3, 0))
+    ray = jnp.where(wanted[..., None], found, end.ray)
+    status = jnp.where(jnp.any(ray != 0, axis=-1), Status.UNBOUNDED.value, end.status)
     return SDPSolution(
-        status=jnp.where(feasible, end.status, phase.status),
+        status=jnp.where(feasible, status, phase.status),
         x=end.x,
         upper=jnp.where(infeasible, jnp.inf, end.upper),
         lower=jnp.where(infeasible & jnp.isinf(phase.reach), jnp.inf, end.lower),
-        ray=end.ray,
+        ray=ray,
         Z=jnp.where(infeasible[..., None, None], phase.certificate, end.dual),
         feasibility=phase,
     )
+
+
+@jax.custom_batching.sequential_vmap
+def _sequential_ray(u: Array, constant: Array, matrices: Array, wanted: Array) -> Array:
+    """A ray by its own feasibility problem, ``sum_i d_i S_i > 0, -u.d > 0``, where one is wanted; 0: none."""
+
+    def search() -> Array:
+        blocks = jax.vmap(jax.scipy.linalg.block_diag)(matrices, -u[:, None, None])
+        goal = gap_goal(1e-8, u.dtype)
+        ray = feasibility(jnp.zeros_like(blocks[0]), blocks, goal).x
+        return find_ray(combine(LMIProblem(u, constant, matrices, ray)), ray[None])
+
+    return jax.lax.cond(wanted, search, lambda: jnp.zeros_like(u))
