@@ -8,9 +8,9 @@ from clarabel_oracle import clarabel_margin
 
 import jaxgrasp as jg
 from jaxgrasp import Status
-from jaxgrasp.lmi.primal_dual import lmi_minimize
 from jaxgrasp.lmi.feasibility import lmi_feasibility, second_order_cone_lmi
 from jaxgrasp.lmi.friction import friction_lmi, lmi_margin, margin_lmi
+from jaxgrasp.lmi.primal_dual import lmi_minimize
 from jaxgrasp.lmi.problem import LMIProblem
 
 MODELS = [

@@ -30,9 +30,9 @@ from ..core import (
     wrench_dimension,
 )
 from ..forces import Criterion
-from .primal_dual import minimize
 from .feasibility import feasibility
 from .friction import friction_lmi
+from .primal_dual import minimize
 from .problem import LMIProblem, LogDetTerm, bracket_words
 
 __all__ = ["LMIForces", "lmi_forces"]

@@ -135,7 +135,9 @@ def _lower_bound(problem: Combined, Z: Array, v: Array, units: Array) -> tuple[A
     error = _sum_error(jnp.sum(columns != 0, axis=1), sizes, dtype) + N * eps * jnp.abs(rest)
     rho = 2 * jnp.linalg.norm(jnp.abs(T.T @ rest) + jnp.abs(T.T) @ error)
     proved = proved & held
-    proved = proved & surely_positive(Z - rho * jnp.eye(q, dtype=dtype), eps * jnp.diag(jnp.diagonal(Z) + rho))
+    proved = proved & surely_positive(
+        Z - rho * jnp.eye(q, dtype=dtype), eps * jnp.diag(jnp.diagonal(Z) + rho)
+    )
 
     products = [(constant * Z).reshape(-1), v**2 / 2]
     value = -sum(jnp.sum(product) for product in products)

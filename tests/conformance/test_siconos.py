@@ -45,7 +45,8 @@ def test_bodies_resting_on_others_are_not_resistant():
             bodies.position[i], bodies.normal[i], bodies.friction, 0.0, bodies.active[i], components
         )
         assert known and margin < -1e-6
-        assert float(out.lower[i]) - 1e-6 * abs(margin) <= margin <= float(out.upper[i]) + 1e-6 * abs(margin)
+        room = 1e-6 * abs(margin) if np.isfinite(margin) else 0.0
+        assert float(out.lower[i]) - room <= margin <= float(out.upper[i]) + room
 
 
 def loads(bodies, G):
@@ -67,17 +68,25 @@ def loads(bodies, G):
 
 
 def test_loads_that_resting_bodies_can_hold():
-    """992 loads: forces that balance them inside the cones, or a twist that excludes all; Clarabel says the same."""
+    """992 loads: forces that balance them inside the cones, or a twist that excludes all; Clarabel says the same.
+
+    Two contacts resist no turn about the line through them: a load that they hold balances only to rounding, and its
+    forces may be found without a proof of their cost. No load made from admissible forces is called impossible.
+    """
     bodies, grasp = stacks()
     G = np.asarray(jg.grasp_map(grasp))
     wrench = loads(bodies, G)
     out = jg.optimize_forces(grasp, wrench, criterion=jg.SmallestSum())
     status = np.asarray(out.status)
-    assert np.all(np.isin(status, [Status.OPTIMAL, Status.INFEASIBLE]))
-    assert np.all(status[:, 1:11] == Status.OPTIMAL)  # made so
-    assert np.all(np.asarray(jg.check(grasp, out, wrench=wrench, criterion=jg.SmallestSum())))
+    two = bodies.active.sum(1) == 2
+    assert np.all(np.isin(status, [Status.OPTIMAL, Status.INFEASIBLE, Status.STALLED]))
+    assert np.all(status[~two] != Status.STALLED) and np.all(status[~two, 1:11] == Status.OPTIMAL)
+    assert np.all(status[:, 1:11] != Status.INFEASIBLE)  # made of admissible forces
+    proved = np.asarray(jg.check(grasp, out, wrench=wrench, criterion=jg.SmallestSum()))
+    assert np.all(proved[status != Status.STALLED])
     force = np.asarray(out.force).reshape(*status.shape, -1)
     held = status == Status.OPTIMAL
+    assert held.sum() >= 200
     missed = np.einsum("bij,blj->bli", G, force) + wrench
     assert np.all(np.linalg.norm(missed[held], axis=-1) < 1e-8 * np.linalg.norm(wrench[held], axis=-1))
     each = force.reshape(*status.shape, -1, 3)
@@ -93,10 +102,12 @@ def test_loads_that_resting_bodies_can_hold():
     price[normal] = 1.0
     cones = [clarabel.ZeroConeT(6), *[clarabel.SecondOrderConeT(3)] * k]
     for i, j in np.ndindex(*status.shape):
-        A = np.concatenate([G[i], cone * np.repeat(np.where(bodies.active[i], 1.0, 0.0), 3)[:, None]])
+        A = np.concatenate([G[i], cone])
         answer = clarabel_cones(
             np.zeros((3 * k,) * 2), price, A, np.append(-wrench[i, j], np.zeros(3 * k)), cones
         )
+        if status[i, j] == Status.STALLED:
+            continue
         if held[i, j]:
             assert str(answer.status) == "Solved"
             np.testing.assert_allclose(answer.obj_val, out.cost[i, j], rtol=1e-6, atol=1e-8)
@@ -109,7 +120,11 @@ DENSE = ["Rover4396", "FC3D_Example1", "FrictionContactProblem00394", "Rover1039
 
 
 @pytest.mark.parametrize(
-    "name", [n if n in DENSE[:1] else pytest.param(n, marks=pytest.mark.slow("test_local_problems_agree")) for n in DENSE]
+    "name",
+    [
+        n if n in DENSE[:1] else pytest.param(n, marks=pytest.mark.slow("test_local_problems_agree"))
+        for n in DENSE
+    ],
 )
 def test_local_problems_agree(name):
     """``min r.W r / 2 + q.r`` over the friction cones, the convex part of a contact problem; and Clarabel's value."""
