@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "tables"))
 from published import DIGITS, SDPLIB, cone_problems, read_sdpa  # noqa: E402 # pyright: ignore
 
-HEAD = "| problem | variables | order | status | lower | upper | published | holds | s |\n|---|---|---|---|---|---|---|---|---|"
+HEAD = "| problem | variables | order | status | lower | upper | published | holds | s |\n" + "|---" * 9 + "|"
 
 
 def solve(name: str, u, constant, matrices, value: float, room: float) -> dict:
@@ -56,8 +56,8 @@ def rows(names: list[str], data: Path):
             yield solve(name, problem.cost, constant, np.array(matrices), problem.value, 2e-6)
     for name, value in SDPLIB.items():
         if name in names:
-            problem = read_sdpa(data / "sdplib" / f"{name}.dat-s")
-            yield solve(name, *problem, value, DIGITS.get(name, 0.0))
+            u, constant, matrices = read_sdpa(data / "sdplib" / f"{name}.dat-s")
+            yield solve(name, u, constant, matrices, value, DIGITS.get(name, 0.0))
 
 
 def main() -> None:
@@ -78,8 +78,8 @@ def main() -> None:
             f"{row['upper']:.10g} | {row['published']:.8g} | {'yes' if row['holds'] else 'NO'} | {row['seconds']} |"
         )
         print(lines[-1], flush=True)
-    options.out.with_suffix(".md").write_text("\n".join(lines) + "\n")
-    options.out.with_suffix(".json").write_text(json.dumps(found, indent=1))
+        options.out.with_suffix(".md").write_text("\n".join(lines) + "\n")
+        options.out.with_suffix(".json").write_text(json.dumps(found, indent=1))
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 """Second-order cones as LMIs (11.12); whether an LMI has a solution, with a proof either way (Definition 4,
-feasibility); the semidefinite program in dual form (Definition 6). The method is that of primal_dual.py."""
+feasibility); the semidefinite program in dual form (Definition 6). The method is primal_dual.py's."""
 
 from __future__ import annotations
 
@@ -81,8 +81,8 @@ class LMIFeasibility(Answer):
     """``lower <= s* <= upper``: is there an x with Q(x) > 0, or at least with Q(x) >= 0?
 
     status       (*batch) int32, a ``Status``: FEASIBLE, Q(x) > 0 at ``x``, rounding allowed for; INFEASIBLE, no x with
-                 Q(x) >= 0: ``certificate`` proves it as far as ``reach``; MARGINAL, neither, and s* <= tolerance: no Q(x) > 0 of
-                 that depth, Q(x) >= 0 remains open; UNDECIDED; INVALID
+                 Q(x) >= 0: ``certificate`` proves it as far as ``reach``; MARGINAL, neither, and s* <= tolerance: no
+                 Q(x) > 0 of that depth, Q(x) >= 0 remains open; UNDECIDED; INVALID
     x            (*batch, N)     strictly feasible where FEASIBLE
     lower, upper (*batch)        bounds of the normalised depth s*; s* > 0 iff the strict LMI has a solution
     certificate  (*batch, q, q)  Z >= 0 with tr Z = 1, and where INFEASIBLE ``tr(Q_i Z) = 0``, ``tr(Q_0 Z) < 0``
@@ -198,13 +198,13 @@ class SDPSolution(Answer):
     """``lower <= min u.x <= upper``: a primal and a dual point of an SDP.
 
     status     (*batch) int32, a ``Status``: OPTIMAL where ``upper - lower <= tolerance * max(1, |upper|)``; UNBOUNDED,
-               ``ray`` proves it; STALLED, the point is feasible but the gap did not close: no Z > 0 may be a dual point,
-               or a ray lies on the edge of its cone; INFEASIBLE; MARGINAL, no strictly feasible start; UNDECIDED;
+               ``ray`` proves it; STALLED, the point is feasible but the gap did not close: no Z > 0 may be a dual
+               point, or a ray lies on the edge of its cone; INFEASIBLE; MARGINAL, no strictly feasible start; UNDECIDED;
                INVALID
     x          (*batch, N)     strictly feasible; NaN where no strictly feasible point was found
     upper      (*batch)        u.x; infinite where INFEASIBLE, NaN where there is no x
-    lower      (*batch)        ``-tr(S_0 Z)``: no feasible x costs less; -infinite where no dual point was found, infinite
-               where INFEASIBLE without limit (``feasibility.reach`` is infinite)
+    lower      (*batch)        ``-tr(S_0 Z)``: no feasible x costs less; -infinite where no dual point was found,
+               infinite where INFEASIBLE without limit (``feasibility.reach`` is infinite)
     ray        (*batch, N)     where UNBOUNDED, d: ``sum_i d_i S_i >= 0``, ``u.d < 0``; else 0
     Z          (*batch, q, q)  Z >= 0 with ``tr(S_i Z) = u_i``; where INFEASIBLE, the certificate: ``tr(S_i Z) = 0``,
                                ``tr(S_0 Z) < 0``
@@ -221,8 +221,8 @@ class SDPSolution(Answer):
 
     SENTENCES: ClassVar[Mapping[Status, str]] = {
         **LMIFeasibility.SENTENCES,
-        Status.STALLED: "Stalled: the point is strictly feasible; rounding, or a problem without a dual point inside its "
-        "cone, ended the method before its gap.",
+        Status.STALLED: "Stalled: the point is strictly feasible; rounding, or a problem without a dual point inside "
+        "its cone, ended the method before its gap.",
         Status.INVALID: "Invalid: a number is not finite.",
     }
 

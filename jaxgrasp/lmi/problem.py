@@ -94,8 +94,8 @@ class LMISolution(Answer):
     iterations: Int[Array, "*batch"]
 
     SENTENCES: ClassVar[Mapping[Status, str]] = {
-        Status.STALLED: "Stalled: rounding, the budget of steps or a problem without a dual point inside its cone ended "
-        "the method before its gap; the best point and the gap reached are given.",
+        Status.STALLED: "Stalled: rounding, the budget of steps or a problem without a dual point inside its cone "
+        "ended the method before its gap; the best point and the gap reached are given.",
         Status.INVALID: "Invalid: the start is not strictly feasible, the curvature is not positive semidefinite, or a "
         "number is not finite.",
     }

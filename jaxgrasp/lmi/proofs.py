@@ -139,10 +139,9 @@ def _lower_bound(problem: Combined, Z: Array, v: Array, units: Array) -> tuple[A
         Z - rho * jnp.eye(q, dtype=dtype), eps * jnp.diag(jnp.diagonal(Z) + rho)
     )
 
-    products = [(constant * Z).reshape(-1), v**2 / 2]
-    value = -sum(jnp.sum(product) for product in products)
-    sizes = sum(jnp.sum(jnp.abs(product)) for product in products)
-    terms = sum(jnp.sum(product != 0) for product in products) + 1
+    products = jnp.append((constant * Z).reshape(-1), v**2 / 2)
+    value, sizes = -jnp.sum(products), jnp.sum(jnp.abs(products))
+    terms = jnp.sum(products != 0) + 1
     Y, w = Z[problem.term, problem.term], problem.weight
     if len(Y):
         values = jnp.linalg.eigvalsh(Y)

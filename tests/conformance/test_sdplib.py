@@ -1,4 +1,4 @@
-"""SDPLIB's small problems: no bracket contradicts a published value, infeasible and unbounded ones with their proofs."""
+"""SDPLIB's small problems: no bracket contradicts a published value; rays and multipliers prove the others."""
 
 import numpy as np
 import pytest

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-# SDPLIB 1.2's README (Borchers, Optim. Methods Softw. 11 (1999)): optimal values of min c.x, sum_i x_i F_i >= F_0, to the
-# digits given there; infinite where nothing is feasible, -infinite where the cost has no lower bound.
+# SDPLIB 1.2's README (Borchers, Optim. Methods Softw. 11 (1999)): optimal values of min c.x, sum_i x_i F_i >= F_0, to
+# the digits given there; infinite where nothing is feasible, -infinite where the cost has no lower bound.
 SDPLIB = {
     "truss1": -8.999996, "truss2": -1.233804e2, "truss3": -9.109996, "truss4": -9.009996,
     "control1": 1.778463e1, "control2": 8.300000, "theta1": 2.300000e1,
@@ -54,7 +54,7 @@ class Bodies(NamedTuple):
 
 
 def read_bodies(path: Path) -> Bodies:
-    """Contacts body by body of an FCLIB file: ``H_body = [D; [r]x D]``, D = (normal, two tangents) of a contact at r."""
+    """Contacts body by body of an FCLIB file: ``H_body = [D; [r]x D]``, D = (normal, tangents) of a contact at r."""
     import h5py
 
     file = h5py.File(path)["fclib_global"]
