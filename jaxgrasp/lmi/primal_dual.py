@@ -232,8 +232,9 @@ def lmi_minimize(problem: LMIProblem, *, tolerance: float = 1e-8, max_steps: int
     ``upper`` and ``lower`` are theorems about the numbers given, not estimates: rounding is allowed for, of the point
     and of the multipliers, which need not be met to the last bit. The gap is driven to
     ``tolerance * max(1, |upper|)``, no lower than the dtype allows: OPTIMAL. A cost that falls for ever along a ray
-    that the path shows is UNBOUNDED (``sdp_minimize`` also looks for one by itself). Where it gets stuck before, the status is STALLED and x is the best point. A start that is not strictly
-    feasible and an H that is not positive semidefinite are INVALID, with ``upper`` NaN. Wrong shapes raise ValueError.
+    that the path shows is UNBOUNDED (``sdp_minimize`` also looks for one by itself). Where it gets stuck before, the
+    status is STALLED and x is the best point. A start that is not strictly feasible and an H that is not positive
+    semidefinite are INVALID, with ``upper`` NaN. Wrong shapes raise ValueError.
     """
     check_shapes(problem)
     goal = gap_goal(tolerance, problem.cost.dtype)
