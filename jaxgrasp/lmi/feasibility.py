@@ -197,10 +197,10 @@ def feasibility(constant: Array, matrices: Array, goal: Array) -> LMIFeasibility
 class SDPSolution(Answer):
     """``lower <= min u.x <= upper``: a primal and a dual point of an SDP.
 
-    status     (*batch) int32, a ``Status``: OPTIMAL where ``upper - lower <= tolerance * max(1, |upper|)``; UNBOUNDED,
-               ``ray`` proves it; STALLED, the point is feasible but the gap did not close: no Z > 0 may be a dual
-               point, or a ray lies on the edge of its cone; INFEASIBLE; MARGINAL, no strictly feasible start; UNDECIDED;
-               INVALID
+    status     (*batch) int32, a ``Status``: OPTIMAL where ``upper - lower <= tolerance * max(1, |upper|)``;
+               UNBOUNDED, ``ray`` proves it; STALLED, the point is feasible but the gap did not close: no Z > 0 may be a
+               dual point, or a ray lies on the edge of its cone; INFEASIBLE; MARGINAL, no strictly feasible start;
+               UNDECIDED; INVALID
     x          (*batch, N)     strictly feasible; NaN where no strictly feasible point was found
     upper      (*batch)        u.x; infinite where INFEASIBLE, NaN where there is no x
     lower      (*batch)        ``-tr(S_0 Z)``: no feasible x costs less; -infinite where no dual point was found,

@@ -20,6 +20,7 @@ PATIENCE = 8  # steps without a better bound after which the method ends
 SHARE = 0.9  # of the way to the edge of the cones
 START = 10.0  # times the slope of the cost: the first multiplier; a small one makes the way back to the centre long
 REFINEMENTS = 2  # of a direction
+FLOOR = 600  # roundoffs, times the order: what rounding may take from the two bounds (float32, order 6: 3e-4)
 POLISHINGS = 2  # of the multipliers that a bound is taken from
 
 
@@ -157,7 +158,7 @@ def _minimize(given: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
     space = coordinates(problem)
     dtype, q = given.cost.dtype, problem.order
 
-    def near(lower: Array, upper: Array) -> Array:
+    def near(lower: Array, upper: Array, goal: Array = goal) -> Array:
         return upper - lower <= goal * jnp.maximum(1.0, jnp.abs(upper))
 
     def unfinished(iterate: _Iterate) -> Array:
@@ -209,7 +210,8 @@ def _minimize(given: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
     end = jax.lax.while_loop(unfinished, advance, start)
     ray = find_ray(problem, jnp.stack([-space.idle, end.x, end.x - given.start, end.direction]))
     ray = jnp.where(interior & jnp.isneginf(end.lower), ray, 0.0)
-    status = jnp.where(near(end.lower, end.upper), Status.OPTIMAL.value, Status.STALLED.value)
+    enough = jnp.maximum(goal, FLOOR * q * unit_roundoff(dtype))
+    status = jnp.where(near(end.lower, end.upper, enough), Status.OPTIMAL.value, Status.STALLED.value)
     status = jnp.where(jnp.any(ray != 0), Status.UNBOUNDED.value, status)
     status = jnp.where(interior, status, Status.INVALID.value).astype(jnp.int32)
     lower = jnp.where(interior, jnp.minimum(end.lower, end.upper), -jnp.inf)
@@ -231,7 +233,8 @@ def lmi_minimize(problem: LMIProblem, *, tolerance: float = 1e-8, max_steps: int
 
     ``upper`` and ``lower`` are theorems about the numbers given, not estimates: rounding is allowed for, of the point
     and of the multipliers, which need not be met to the last bit. The gap is driven to
-    ``tolerance * max(1, |upper|)``, no lower than the dtype allows: OPTIMAL. A cost that falls for ever along a ray
+    ``tolerance * max(1, |upper|)``, no lower than the dtype and the order q allow (600 q eps): OPTIMAL. A cost that
+    falls for ever along a ray
     that the path shows is UNBOUNDED (``sdp_minimize`` also looks for one by itself). Where it gets stuck before, the
     status is STALLED and x is the best point. A start that is not strictly feasible and an H that is not positive
     semidefinite are INVALID, with ``upper`` NaN. Wrong shapes raise ValueError.
