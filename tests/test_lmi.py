@@ -8,9 +8,9 @@ from clarabel_oracle import clarabel_margin
 
 import jaxgrasp as jg
 from jaxgrasp import Status
-from jaxgrasp.lmi.barrier import lmi_minimize
 from jaxgrasp.lmi.feasibility import lmi_feasibility, second_order_cone_lmi
 from jaxgrasp.lmi.friction import friction_lmi, lmi_margin, margin_lmi
+from jaxgrasp.lmi.primal_dual import lmi_minimize
 from jaxgrasp.lmi.problem import LMIProblem
 
 MODELS = [
@@ -206,8 +206,9 @@ def test_bad_starts_unbounded_problems_and_few_steps_are_reported(dtype):
     assert np.isnan(infeasible_start.upper)
     assert infeasible_start.status == Status.INVALID
     unbounded = lmi_minimize(problem([-1.0], np.eye(2), [np.eye(2)], [0.0], dtype))
-    assert unbounded.status == Status.STALLED
-    assert float(unbounded.gap) == np.inf
+    assert unbounded.status == Status.UNBOUNDED
+    assert float(unbounded.gap) == np.inf and float(unbounded.lower) == -np.inf
+    assert float(unbounded.ray[0]) > 0
     short = lmi_minimize(problem([1.0], -np.eye(2), [np.eye(2)], [20.0], dtype), tolerance=1e-8, max_steps=3)
     assert int(short.iterations) == 3
     assert short.status == Status.STALLED

@@ -85,8 +85,9 @@ def test_a_concave_cost_and_an_unheld_direction_are_refused(dtype):
     assert np.isnan(jg.lmi.lmi_minimize(concave).upper)
     free = jg.lmi.LMIProblem(*arrays(dtype, [1.0, 1.0], -np.eye(2), [np.eye(2), 0 * np.eye(2)], [5.0, 0.0]))
     answer = jg.lmi.lmi_minimize(free)
-    assert answer.status != Status.OPTIMAL
+    assert answer.status == Status.UNBOUNDED
     assert float(answer.gap) == np.inf
+    np.testing.assert_array_equal(answer.ray, [0.0, -1.0])
 
 
 # Feasibility -------------------------------------------------------------------------------------------
@@ -122,6 +123,88 @@ def test_no_answer_depends_on_units(dtype):
     assert bool((answer.status == Status.FEASIBLE).all())
     np.testing.assert_allclose(answer.lower, answer.lower[0], rtol=1e-3)
     np.testing.assert_allclose(np.asarray(answer.x)[:, 0] / scale, float(answer.x[0, 0]) * 1e3, rtol=1e-2)
+
+
+def diagonal(*rows):
+    """Rows ``g + H x >= 0`` as an LMI: S_0 and S_1 .. S_N."""
+    rows = np.array(rows, float)
+    return np.diag(rows[:, 0]), np.stack([np.diag(column) for column in rows.T[1:]])
+
+
+def test_infeasible_everywhere_and_infeasible_in_reach(dtype):
+    """``x >= 2, x <= 1`` at no x; ``[[x, 1], [1, 1e-9]]`` from 1e9 on: nothing may say that it never is."""
+    never = jg.lmi.sdp_minimize(*arrays(dtype, [1.0], *diagonal([-2, 1], [1, -1])))
+    assert never.status == Status.INFEASIBLE
+    assert float(never.feasibility.reach) == np.inf
+    assert float(never.lower) == float(never.upper) == np.inf
+    e = np.diag([1.0, 0.0])
+    far = jg.lmi.sdp_minimize(*arrays(dtype, [1.0], np.array([[0.0, 1.0], [1.0, 1e-9]]), e[None]))
+    assert float(far.lower) <= 1e9
+    assert np.isfinite(far.feasibility.reach)
+
+
+# Rays --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("cost", "rows", "expected"),
+    [
+        ([-1, 0], [[0, 1, 0], [1, 0, 1], [1, 0, -1]], [1, 0]),  # x_2 in [-1, 1]: the cone has no inside
+        ([-1, -1], [[1, 1, -1], [1, -1, 1], [0, 1, 0], [0, 0, 1]], [1, 1]),  # along x_1 = x_2 alone
+        ([1, -1], [[1, 1, 0], [1, 0, -1], [1, -1, -1]], None),  # bounded: x_1 >= -1, x_2 <= 1
+        ([1, 2], [[-1, 1, 1], [5, -1, -1]], [1, -1]),  # the same matrix twice, other costs
+    ],
+)
+def test_rays_of_linear_programs(cost, rows, expected):
+    out = jg.lmi.sdp_minimize(*arrays("float64", cost, *diagonal(*rows)))
+    if expected is None:
+        assert out.status == Status.OPTIMAL
+        np.testing.assert_allclose(out.upper, -2.0, rtol=1e-7)
+        np.testing.assert_array_equal(out.ray, 0.0)
+        return
+    assert out.status == Status.UNBOUNDED
+    assert float(out.lower) == -np.inf
+    ray = np.asarray(out.ray)
+    assert ray @ cost < 0
+    assert np.all(np.array(rows, float)[:, 1:] @ ray >= 0)  # sums of a few small numbers: exact
+    np.testing.assert_allclose(ray / np.abs(ray).max(), expected, atol=1e-3)
+
+
+def test_a_ray_along_which_the_curvature_grows_is_none():
+    """``min x^2 / 2 - x`` over all x >= -1 is -1/2; without the square it falls for ever."""
+    rows = diagonal([1, 1])
+    curved = jg.lmi.LMIProblem(*arrays("float64", [-1.0], *rows, [0.0], [[1.0]]))
+    out = jg.lmi.lmi_minimize(curved)
+    assert out.status == Status.OPTIMAL
+    np.testing.assert_allclose(out.upper, -0.5, rtol=1e-7)
+    assert float(out.lower) <= -0.5 <= float(out.upper)
+    straight = jg.lmi.lmi_minimize(jg.lmi.LMIProblem(*arrays("float64", [-1.0], *rows, [0.0])))
+    assert straight.status == Status.UNBOUNDED
+
+
+# Ill-posed problems ------------------------------------------------------------------------------------
+
+
+def test_a_minimum_that_is_not_reached_has_no_false_bound():
+    """``min x, [[x, 1], [1, y]] >= 0``: 0, for y without bound. No Z > 0 is a dual point."""
+    x, y, one = np.diag([1.0, 0.0]), np.diag([0.0, 1.0]), np.array([[0.0, 1.0], [1.0, 0.0]])
+    out = jg.lmi.sdp_minimize(*arrays("float64", [1.0, 0.0], one, [x, y]))
+    assert out.status == Status.STALLED
+    assert float(out.upper) > 0  # how near to 0 is another matter
+    assert float(out.lower) <= 0.0
+
+
+def test_bounds_hold_in_closed_form():
+    """``min x, x I >= M``: the largest eigenvalue, for M of rank one known exactly: |v|^2 with whole entries."""
+    rng = np.random.default_rng(5)
+    v = rng.integers(-9, 10, size=(200, 4)).astype(float)
+    v[:, 0] += v[:, 0] == 0
+    M = v[:, :, None] * v[:, None, :]
+    eye = np.broadcast_to(np.eye(4), (200, 1, 4, 4))
+    out = jg.lmi.sdp_minimize(*arrays("float64", np.ones((200, 1)), -M, eye))
+    exact = np.sum(v * v, axis=1)
+    assert np.all(np.asarray(out.lower) <= exact) and np.all(exact <= np.asarray(out.upper))
+    assert np.all(np.asarray(out.status) == Status.OPTIMAL)
 
 
 # The semidefinite program ------------------------------------------------------------------------------
@@ -183,9 +266,14 @@ def test_random_programs_agree_with_clarabel():
     impossible = status == "PrimalInfeasible"
     assert np.all(np.isposinf(np.asarray(out.upper)[impossible]))
     assert np.all(np.einsum("nab,nab->n", constant, multiplier)[impossible] < 0)
+    assert np.all(np.isposinf(np.asarray(out.lower)[impossible]))  # no x at all, however large
     unbounded = status == "DualInfeasible"
     assert np.all(np.asarray(out.gap)[unbounded] == np.inf)
-    assert not np.any(np.asarray(out.status)[unbounded] == Status.OPTIMAL)
+    np.testing.assert_array_equal(out.status[unbounded], Status.UNBOUNDED)
+    ray = np.asarray(out.ray)
+    assert np.all(np.einsum("ni,ni->n", ray, u)[unbounded] < 0)
+    assert np.all(np.linalg.eigvalsh(np.einsum("ni,niab->nab", ray, S))[unbounded, 0] > 0)
+    assert np.all(ray[~unbounded] == 0)
     np.testing.assert_array_equal(out.status[impossible], Status.INFEASIBLE)
     np.testing.assert_array_equal(out[3].feasibility.status, out.feasibility.status[3])
 

@@ -97,6 +97,7 @@ class Status(IntEnum):
     )
     # Linear matrix inequalities.
     FEASIBLE = 21, "Feasible: the point satisfies every constraint strictly."
+    UNBOUNDED = 22, "Unbounded: the cost falls for ever along the ray, which never leaves the feasible set."
     # What an answer's evidence proves.
     PROVED_EXACTLY = (
         23,

@@ -1,5 +1,5 @@
 """Second-order cones as LMIs (11.12); whether an LMI has a solution, with a proof either way (Definition 4,
-feasibility); the semidefinite program in dual form (Definition 6). The method is that of barrier.py."""
+feasibility); the semidefinite program in dual form (Definition 6). The method is primal_dual.py's."""
 
 from __future__ import annotations
 
@@ -24,8 +24,10 @@ from ..core import (
     rounding_constant,
     unit_roundoff,
 )
-from .barrier import lmi_minimize, minimize
+from .combined import combine
+from .primal_dual import lmi_minimize, minimize
 from .problem import LMIProblem, bracket_words, expect_shape, over_batch
+from .proofs import find_ray, lower_bound, upper_bound
 
 __all__ = [
     "LMIFeasibility",
@@ -80,13 +82,14 @@ def _arrow(A: Array, b: Array, c: Array, d: Array) -> tuple[Array, Array]:
 class LMIFeasibility(Answer):
     """``lower <= s* <= upper``: is there an x with Q(x) > 0, or at least with Q(x) >= 0?
 
-    status       (*batch) int32, a ``Status``: FEASIBLE, Q(x) > 0 at ``x``; INFEASIBLE, no x with Q(x) >= 0:
-                 ``certificate`` proves it as far as ``reach``; MARGINAL, neither, and s* <= tolerance: no Q(x) > 0 of
-                 that depth, Q(x) >= 0 remains open; UNDECIDED; INVALID
+    status       (*batch) int32, a ``Status``: FEASIBLE, Q(x) > 0 at ``x``, rounding allowed for; INFEASIBLE, no x with
+                 Q(x) >= 0: ``certificate`` proves it as far as ``reach``; MARGINAL, neither, and s* <= tolerance: no
+                 Q(x) > 0 of that depth, Q(x) >= 0 remains open; UNDECIDED; INVALID
     x            (*batch, N)     strictly feasible where FEASIBLE
     lower, upper (*batch)        bounds of the normalised depth s*; s* > 0 iff the strict LMI has a solution
     certificate  (*batch, q, q)  Z >= 0 with tr Z = 1, and where INFEASIBLE ``tr(Q_i Z) = 0``, ``tr(Q_0 Z) < 0``
-    reach        (*batch)        Z excludes every x with ``|x_i| |Q_i| < reach |Q_0|`` as a vector, no unit; 0: none
+    reach        (*batch)        Z excludes every x with ``|x_i| |Q_i| < reach |Q_0|`` as a vector, no unit; infinite:
+                 multipliers next to Z meet their equations exactly and exclude every x; 0: none
     """
 
     status: Int[Array, "*batch"]
@@ -125,8 +128,9 @@ def lmi_feasibility(
 
     The multiplier Z of the matrix block answers the rest. ``Z >= 0`` with ``tr(Q_i Z) = 0`` and ``tr(Q_0 Z) < 0``
     makes ``tr(Q(x) Z) < 0`` for every x, so Q(x) >= 0 has no solution. In floating point the traces are zero up to
-    some rho, and Z excludes every x with ``|x| < -tr(Q_0 Z) / rho``; the answer is INFEASIBLE where this reach is
-    at least 1 / tolerance. An LMI that has solutions only as x grows without bound, or none but almost (``[[x, 1],
+    some rho. Where Z > 0 by more, traces that are exactly zero belong to some Z next to it, and the reach is infinite;
+    else Z excludes every x with ``|x| < -tr(Q_0 Z) / rho``, and the answer is INFEASIBLE where this reach is at least
+    1 / tolerance. An LMI that has solutions only as x grows without bound, or none but almost (``[[x, 1],
     [1, 0]]``), is MARGINAL. Wrong shapes raise ValueError.
     """
     constant, matrices = real_array(constant, "constant"), real_array(matrices, "matrices")
@@ -167,21 +171,25 @@ def feasibility(constant: Array, matrices: Array, goal: Array) -> LMIFeasibility
     end = minimize(LMIProblem(down, centre, blocks, down), goal)
 
     depth = -end.upper
-    rounding = rounding_constant() * q * unit_roundoff(dtype)
-    feasible = depth > rounding
+    x = end.x[1:-1] / end.x[0] * sizes[0] / sizes[1:]
+    still = LMIProblem(jnp.zeros_like(x), constant, matrices, x)
+    feasible = (depth > 0) & jnp.isfinite(upper_bound(combine(still), x))
     Z = end.dual[:q, :q]
     total = jnp.trace(Z)
     Z = Z / jnp.where(total > 0, total, 1.0)
+    # A cost of zero that is at least something positive: nothing is feasible.
+    least, _ = lower_bound(combine(still), Z, jnp.zeros(0, dtype))
+    rounding = rounding_constant() * q * unit_roundoff(dtype)
     traces = jnp.einsum("iab,ab->i", scaled, Z)
     leak = jnp.sqrt(jnp.sum(traces[1:] ** 2)) + rounding
     reach = jnp.maximum(-traces[0] - rounding, 0.0) / leak
+    reach = jnp.where(least > 0, jnp.inf, reach)
     infeasible = ~feasible & (reach * goal >= 1)
     finite = jnp.all(jnp.isfinite(constant)) & jnp.all(jnp.isfinite(matrices))
     status = jnp.where(-end.lower <= goal, Status.MARGINAL.value, Status.UNDECIDED.value)
     status = jnp.where(infeasible, Status.INFEASIBLE.value, status)
     status = jnp.where(feasible, Status.FEASIBLE.value, status)
     status = jnp.where(finite, status, Status.INVALID.value).astype(jnp.int32)
-    x = end.x[1:-1] / end.x[0] * sizes[0] / sizes[1:]
     return LMIFeasibility(status, x, depth, -end.lower, Z, reach)
 
 
@@ -191,12 +199,15 @@ def feasibility(constant: Array, matrices: Array, goal: Array) -> LMIFeasibility
 class SDPSolution(Answer):
     """``lower <= min u.x <= upper``: a primal and a dual point of an SDP.
 
-    status     (*batch) int32, a ``Status``: OPTIMAL where ``upper - lower <= tolerance * max(1, |upper|)``; STALLED,
-               the point is feasible but the gap did not close, as when u.x is unbounded; INFEASIBLE; MARGINAL, no
-               strictly feasible start; UNDECIDED; INVALID
+    status     (*batch) int32, a ``Status``: OPTIMAL where ``upper - lower <= tolerance * max(1, |upper|)``;
+               UNBOUNDED, ``ray`` proves it; STALLED, the point is feasible but the gap did not close: no Z > 0 may be a
+               dual point, or a ray lies on the edge of its cone; INFEASIBLE; MARGINAL, no strictly feasible start;
+               UNDECIDED; INVALID
     x          (*batch, N)     strictly feasible; NaN where no strictly feasible point was found
     upper      (*batch)        u.x; infinite where INFEASIBLE, NaN where there is no x
-    lower      (*batch)        ``-tr(S_0 Z)``: no feasible x costs less; -infinite where no dual point was found
+    lower      (*batch)        ``-tr(S_0 Z)``: no feasible x costs less; -infinite where no dual point was found,
+               infinite where INFEASIBLE without limit (``feasibility.reach`` is infinite)
+    ray        (*batch, N)     where UNBOUNDED, d: ``sum_i d_i S_i >= 0``, ``u.d < 0``; else 0
     Z          (*batch, q, q)  Z >= 0 with ``tr(S_i Z) = u_i``; where INFEASIBLE, the certificate: ``tr(S_i Z) = 0``,
                                ``tr(S_0 Z) < 0``
     feasibility                the answer of phase one, (*batch)
@@ -206,13 +217,14 @@ class SDPSolution(Answer):
     x: Float[Array, "*batch N"]
     upper: Float[Array, "*batch"]
     lower: Float[Array, "*batch"]
+    ray: Float[Array, "*batch N"]
     Z: Float[Array, "*batch q q"]
     feasibility: LMIFeasibility
 
     SENTENCES: ClassVar[Mapping[Status, str]] = {
         **LMIFeasibility.SENTENCES,
-        Status.STALLED: "Stalled: the point is strictly feasible; rounding or a cost without a lower bound ended the "
-        "method before its gap.",
+        Status.STALLED: "Stalled: the point is strictly feasible; rounding, or a problem without a dual point inside "
+        "its cone, ended the method before its gap.",
         Status.INVALID: "Invalid: a number is not finite.",
     }
 
@@ -253,11 +265,29 @@ def sdp_minimize(
     batch = end.batch_shape
     phase = jax.tree.map(lambda x: jnp.broadcast_to(x, (*batch, *x.shape[feasible.ndim :])), phase)
     infeasible = phase.status == Status.INFEASIBLE.value
+    wanted = (end.status == Status.STALLED.value) & jnp.isneginf(end.lower)
+    found = over_batch(lambda one: _sequential_ray(*one), (u, constant, matrices, wanted), (1, 2, 3, 0))
+    ray = jnp.where(wanted[..., None], found, end.ray)
+    status = jnp.where(jnp.any(ray != 0, axis=-1), Status.UNBOUNDED.value, end.status)
     return SDPSolution(
-        status=jnp.where(feasible, end.status, phase.status),
+        status=jnp.where(feasible, status, phase.status),
         x=end.x,
         upper=jnp.where(infeasible, jnp.inf, end.upper),
-        lower=jnp.where(infeasible, jnp.inf, end.lower),
+        lower=jnp.where(infeasible & jnp.isinf(phase.reach), jnp.inf, end.lower),
+        ray=ray,
         Z=jnp.where(infeasible[..., None, None], phase.certificate, end.dual),
         feasibility=phase,
     )
+
+
+@jax.custom_batching.sequential_vmap
+def _sequential_ray(u: Array, constant: Array, matrices: Array, wanted: Array) -> Array:
+    """A ray by its own feasibility problem, ``sum_i d_i S_i > 0, -u.d > 0``, where one is wanted; 0: none."""
+
+    def search() -> Array:
+        blocks = jax.vmap(jax.scipy.linalg.block_diag)(matrices, -u[:, None, None])
+        goal = gap_goal(1e-8, u.dtype)
+        ray = feasibility(jnp.zeros_like(blocks[0]), blocks, goal).x
+        return find_ray(combine(LMIProblem(u, constant, matrices, ray)), ray[None])
+
+    return jax.lax.cond(wanted, search, lambda: jnp.zeros_like(u))

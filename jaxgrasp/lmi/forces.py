@@ -2,7 +2,7 @@
 
 Small and general, for teaching and for checking the structured solver: forces are written ``f = f_p + V z`` with
 ``G f_p = -w`` and V a basis of Null(G), the friction cones are the LMI ``P(f) >= 0`` of (11.14), every limit is a 1 x 1
-block, and a log-det barrier method does the rest.
+block, and a primal-dual method does the rest.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from ..core import (
     wrench_dimension,
 )
 from ..forces import Criterion
-from .barrier import minimize
 from .feasibility import feasibility
 from .friction import friction_lmi
+from .primal_dual import minimize
 from .problem import LMIProblem, LogDetTerm, bracket_words
 
 __all__ = ["LMIForces", "lmi_forces"]
@@ -150,7 +150,7 @@ def _solve(grasp: Grasp, wrench, criterion, limit, torques, tolerance: float) ->
     def flat(leaf: Array) -> Array:
         return leaf.reshape(-1, *leaf.shape[axes:])
 
-    # One after another, see barrier.minimize.
+    # One after another, see primal_dual.minimize.
     optimize = jax.custom_batching.sequential_vmap(_optimize)
 
     def one_grasp(parts, rows: Array) -> LMIForces:

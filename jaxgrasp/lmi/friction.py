@@ -1,7 +1,7 @@
 """The friction LMI of a grasp, its reduction to Null(G), and the margin by this road (11.9)-(11.17).
 
 The second road to every answer of section 11.2: small and general, for teaching and for checking the
-structured solver. The methods that solve LMIs are in barrier.py and feasibility.py.
+structured solver. The methods that solve LMIs are in primal_dual.py and feasibility.py.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from ..conic import eigenvalues
 from ..contacts import Grasp, cleared, is_grasp, null_space
 from ..core import Array, Bool, Float, nan_where, rank_tolerance
-from .barrier import lmi_minimize
+from .primal_dual import lmi_minimize
 from .problem import LMIProblem, expect_shape
 
 __all__ = ["FrictionLMI", "friction_lmi", "is_grasp", "lmi_margin", "margin_lmi"]

@@ -72,13 +72,14 @@ class LMIProblem(eqx.Module):
 class LMISolution(Answer):
     """``lower <= min h <= upper``: a strictly feasible point and how far from optimal it can be.
 
-    status      (*batch) int32, a ``Status``: OPTIMAL where ``upper - lower <= tolerance * max(1, |upper|)``, else
-                STALLED, with the last point; INVALID where there is no start
-    x           (*batch, N)     strictly feasible
-    upper       (*batch)        its cost; NaN where INVALID
+    status      (*batch) int32, a ``Status``: OPTIMAL where ``upper - lower <= tolerance * max(1, |upper|)``; UNBOUNDED,
+                ``ray`` proves it; else STALLED, with the best point; INVALID where there is no start
+    x           (*batch, N)     strictly feasible, rounding allowed for
+    upper       (*batch)        its cost, rounded up; NaN where INVALID
     lower       (*batch)        no feasible x costs less; -infinite before the first dual point
     dual        (*batch, q, q)  Z >= 0, the multiplier of Q(x) >= 0 that proves ``lower``; 0 before
-    iterations  (*batch)        Newton steps, int32
+    ray         (*batch, N)     where UNBOUNDED, d: ``sum_i d_i Q_i >= 0``, B likewise, ``H d = 0``, ``c.d < 0``; else 0
+    iterations  (*batch)        steps, int32
 
     For a linear cost ``lower = -tr(Q_0 Z)`` with ``Z >= 0, tr(Q_i Z) = c_i``; with curvature
     ``-tr(Q_0 Z) - 1/2 y^T H y``, ``tr(Q_i Z) = c_i + (H y)_i`` for some y; a log-det term has a multiplier of its own.
@@ -89,11 +90,12 @@ class LMISolution(Answer):
     upper: Float[Array, "*batch"]
     lower: Float[Array, "*batch"]
     dual: Float[Array, "*batch q q"]
+    ray: Float[Array, "*batch N"]
     iterations: Int[Array, "*batch"]
 
     SENTENCES: ClassVar[Mapping[Status, str]] = {
-        Status.STALLED: "Stalled: rounding, the budget of steps or a cost without a lower bound ended the method "
-        "before its gap; the last point and the gap reached are given.",
+        Status.STALLED: "Stalled: rounding, the budget of steps or a problem without a dual point inside its cone "
+        "ended the method before its gap; the best point and the gap reached are given.",
         Status.INVALID: "Invalid: the start is not strictly feasible, the curvature is not positive semidefinite, or a "
         "number is not finite.",
     }

@@ -1,4 +1,4 @@
-"""Where the real meshes are that tests marked ``realdata`` need."""
+"""Where the real meshes and published problems are that tests marked ``realdata`` need."""
 
 import os
 from pathlib import Path
@@ -6,10 +6,15 @@ from pathlib import Path
 import pytest
 
 
-def real_meshes() -> Path:
-    """The folder ``meshes`` of JAXGRASP_DATA or, failing that, of the shared data; skips where neither exists."""
+def real_data(name: str) -> Path:
+    """The folder ``name`` of JAXGRASP_DATA or, failing that, of the shared data; skips where neither exists."""
     told = os.environ.get("JAXGRASP_DATA")
     folder = Path(told) if told else Path(__file__).parents[3] / "shared" / "data"
-    if not (folder / "meshes").is_dir():
-        pytest.skip("no real meshes: set JAXGRASP_DATA to a folder that holds meshes/")
-    return folder / "meshes"
+    if not (folder / name).is_dir():
+        pytest.skip(f"no real data: set JAXGRASP_DATA to a folder that holds {name}/")
+    return folder / name
+
+
+def real_meshes() -> Path:
+    """The folder of real meshes."""
+    return real_data("meshes")

@@ -1,0 +1,96 @@
+"""SDPLIB's small problems: no bracket contradicts a published value; rays and multipliers prove the others."""
+
+import numpy as np
+import pytest
+from published import DIGITS, SDPLIB, read_sdpa
+from real_data import real_data
+
+import jaxgrasp as jg
+from jaxgrasp import Status
+
+pytestmark = pytest.mark.realdata
+
+POSED = ["truss1", "truss4", "control1"]
+# No Z > 0 is a dual point of these: upper bounds alone, or brackets that do not close.
+ILL_POSED = [f"hinf{i}" for i in range(1, 11)]
+
+
+def solved(name):
+    u, constant, matrices = read_sdpa(real_data("conformance") / "sdplib" / f"{name}.dat-s")
+    return jg.lmi.sdp_minimize(u, constant, matrices), u, constant, matrices
+
+
+def surely_semidefinite(matrix):
+    """By eigenvalues, with room for their rounding."""
+    values = np.linalg.eigvalsh(matrix)
+    return values[0] > len(values) * 2.0**-52 * np.abs(values).max()
+
+
+def check_bracket(name, out, u, constant, matrices):
+    x, value, width = np.asarray(out.x), SDPLIB[name], DIGITS[name]
+    assert surely_semidefinite(constant + np.einsum("i,iab->ab", x, matrices))
+    assert u @ x <= float(out.upper) <= u @ x + 1e-9 * (1 + np.abs(u) @ np.abs(x))
+    assert float(out.lower) <= value + width
+    assert float(out.upper) >= value - width
+    if np.isfinite(out.lower):
+        Z = np.asarray(out.Z)
+        assert surely_semidefinite(Z)
+        rest = np.einsum("iab,ab->i", matrices, Z) - u
+        size = np.einsum("iab,ab->i", np.abs(matrices), np.abs(Z))
+        assert np.all(np.abs(rest) <= 1e-13 * size)
+        np.testing.assert_allclose(-np.sum(constant * Z), out.lower, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["truss4", *(pytest.param(n, marks=pytest.mark.slow("test_well_posed_problems_are_optimal")) for n in (
+        "truss1", "truss2", "truss3", "control1", "control2", "theta1",
+    ))],
+)  # fmt: skip
+def test_well_posed_problems_are_optimal(name):
+    out, *problem = solved(name)
+    assert out.status == Status.OPTIMAL
+    check_bracket(name, out, *problem)
+    assert float(out.gap) <= 1e-8 * max(1, abs(SDPLIB[name])) * 1.01
+    assert abs(float(out.upper) - SDPLIB[name]) <= DIGITS[name]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["hinf3", *(pytest.param(n, marks=pytest.mark.slow("test_ill_posed_problems_are_undecided_or_right"))
+                for n in ILL_POSED if n != "hinf3")],
+)  # fmt: skip
+def test_ill_posed_problems_are_undecided_or_right(name):
+    """The cost of the point is the published one to its few digits; the bound is a true one or none."""
+    out, *problem = solved(name)
+    assert Status(out.status) in (Status.OPTIMAL, Status.STALLED)
+    check_bracket(name, out, *problem)
+    assert abs(float(out.upper) - SDPLIB[name]) <= DIGITS[name]
+
+
+@pytest.mark.parametrize("name", ["infd1", "infd2"])
+def test_unbounded_problems_have_a_ray(name):
+    """The cost falls along the ray, S(x) stays positive: at x and far from it."""
+    out, u, constant, matrices = solved(name)
+    assert out.status == Status.UNBOUNDED
+    x, ray = np.asarray(out.x), np.asarray(out.ray)
+    assert u @ ray < -1e-3 * np.linalg.norm(u) * np.linalg.norm(ray)
+    assert surely_semidefinite(np.einsum("i,iab->ab", ray, matrices))
+    for far in (0.0, 1.0, 1e6, 1e12):
+        assert surely_semidefinite(constant + np.einsum("i,iab->ab", x + far * ray, matrices))
+    assert float(out.lower) == -np.inf
+
+
+@pytest.mark.parametrize("name", ["infp1", "infp2"])
+def test_infeasible_problems_have_multipliers(name):
+    """``Z > 0, tr(S_i Z) = 0, tr(S_0 Z) < 0``, for every x."""
+    out, _, constant, matrices = solved(name)
+    assert out.status == Status.INFEASIBLE
+    assert float(out.lower) == float(out.upper) == float(out.feasibility.reach) == np.inf
+    Z = np.asarray(out.Z)
+    assert surely_semidefinite(Z)
+    rest = np.linalg.norm(np.einsum("iab,ab->i", matrices, Z))
+    columns = matrices.reshape(len(matrices), -1)
+    change = 2 * rest / np.linalg.svd(columns, compute_uv=False)[-1]  # that makes the traces exactly zero
+    assert change < np.linalg.eigvalsh(Z)[0]
+    assert np.sum(constant * Z) + change * np.linalg.norm(constant) < 0
