@@ -81,10 +81,11 @@ def prove_resistance(grasp, answer, tolerance: float | None = None) -> Proof:
     batch, dimension, known = grasp.position.shape[:-2], grasp.position.shape[-1], rebuild(grasp)
     claim = claim_of(grasp, answer, known)
     eps = float(np.finfo(np.dtype(grasp.position.dtype)).eps)
-    parts = [
-        _proved(_part(known, lanes), _part(claim, lanes), dimension, eps, tolerance)
-        for lanes in _slices(len(known.valid))
-    ]
+    with np.errstate(all="ignore"):
+        parts = [
+            _proved(_part(known, lanes), _part(claim, lanes), dimension, eps, tolerance)
+            for lanes in _slices(len(known.valid))
+        ]
     level, distance = (np.concatenate(x).reshape(batch) for x in zip(*parts, strict=True)) if parts else (
         np.zeros(batch, int), np.zeros(batch),
     )  # fmt: skip
@@ -126,11 +127,10 @@ def _proved(
     known: Rebuilt, claim: Claim, dimension: int, eps: float, tolerance: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Levels 0, 1, 2 and distances (N,)."""
-    with np.errstate(all="ignore"):
-        claim = of_size_one(known, claim, dimension)
-        facts = _facts(known, claim)
-        fits = numeric_rank_fits(known.A, claim.rank, facts.sigma, eps)
-        marginal = _marginal(claim, tolerance, eps)
+    claim = of_size_one(known, claim, dimension)
+    facts = _facts(known, claim)
+    fits = numeric_rank_fits(known.A, claim.rank, facts.sigma, eps)
+    marginal = _marginal(claim, tolerance, eps)
     sound = known.valid & fits & (claim.lower <= claim.upper) & np.isin(claim.status, (1, 2, 3, 4))
     full = claim.rank == known.A.shape[1]
     sound &= np.select([claim.status == RESISTANT, claim.status == MARGINAL], [full, full & marginal], True)
