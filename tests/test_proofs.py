@@ -313,19 +313,20 @@ def test_forged_lines_are_refused_by_number(lines, tmp_path):
     forged = []
     for line, field, value in [
         (yes, "claim", "NOT_RESISTANT"), (yes, "claim", 7), (yes, "margin", [(2.0).hex(), (3.0).hex()]),
-        (yes, "margin", [None, (-1.0).hex()]), (yes, "friction", ["0x0.0p+0"] * 4), (yes, "force", [["0x0.0p+0"] * 3] * 4),
+        (yes, "margin", [None, (-1.0).hex()]), (yes, "friction", ["0x0.0p+0"] * 4),
+        (yes, "force", [["0x0.0p+0"] * 3] * 4),
         (yes, "position", yes["normal"]), (yes, "force", None), (yes, "spin", []), (no, "twist", ["0x0.0p+0"] * 6),
         (no, "claim", "RESISTANT"), (no, "proof", "to rounding"), (no, "twist", ["nan"] * 6), (yes, "dimension", 2),
-        (no, "twist", ["0x1.0p+9999"] * 6), (no, "twist", ["1e5"] * 6), (yes, "dimension", 3.0), (yes, "normal", [[]] * 4),
+        (no, "twist", ["0x1.0p+9999"] * 6), (no, "twist", ["1e5"] * 6), (yes, "dimension", 3.0),
+        (yes, "normal", [[]] * 4),
     ]:  # fmt: skip
         forged.append({**line, field: value})
     moved = json.loads(json.dumps(yes))
     moved["force"][0][0] = _bit(moved["force"][0][0])
     told = written(tmp_path / "p.jsonl", [*forged, moved, yes])
     assert told.returncode == 1
-    assert [f"line {i + 1}: REFUSED" in told.stdout for i in range(len(forged) + 2)] == [True] * (
-        len(forged) + 1
-    ) + [False]
+    refused = [f"line {i + 1}: REFUSED" in told.stdout for i in range(len(forged) + 2)]
+    assert refused == [True] * (len(forged) + 1) + [False]
 
 
 def test_damaged_lines_are_refused_by_number(tmp_path):
@@ -395,5 +396,5 @@ def test_a_cube_surrounds_its_ball():
     assert polytope.ball_inside(corners, facets) == pytest.approx(1, rel=1e-12)
     assert polytope.ball_inside(corners, facets) <= 1
     assert polytope.ball_inside(corners, facets[1:]) == 0
-    assert polytope.ball_inside(corners + [1.5, 0, 0], facets) == 0
+    assert polytope.ball_inside(corners + np.array([1.5, 0, 0]), facets) == 0
     assert polytope.ball_inside(corners, np.concatenate([facets, facets])) == 0
