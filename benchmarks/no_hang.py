@@ -13,6 +13,7 @@ import threading
 import time
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jaxgrasp as jg
@@ -28,7 +29,9 @@ def cases(count: int) -> dict:
     grasp = jg.Grasp(position, normal, jg.HardFinger(0.5))
     body = jg.RigidBody(0.3, np.diag([2e-4, 2e-4, 1e-4]))
     state = jg.BodyState(
-        0.001 * rng.normal(size=(count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, 6))
+        jnp.asarray(0.001 * rng.normal(size=(count, 3))),
+        jnp.tile(jnp.array([1.0, 0, 0, 0]), (count, 1)),
+        jnp.zeros((count, 6)),
     )
     load = np.array([0, 0, -3.0, 0, 0, 0])
 

@@ -155,7 +155,7 @@ def test_the_callers_problem_is_proved():
         {"internal_force": np.zeros(3)}, {"escape_twist": np.zeros((6, 1))}, {"rank": None},
         {"bound_twist": np.array([object()] * 6)}, {"status": [[1], [2, 3]]}, {"lower": {}},
     ],
-    ids=str,
+    ids=list("abcdefghi"),
 )  # fmt: skip
 def test_a_malformed_answer_is_refused_without_an_exception(field):
     from jaxgrasp.certificates import Malformed, prove_resistance

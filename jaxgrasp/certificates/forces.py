@@ -35,7 +35,7 @@ INVALID, OPTIMAL, INFEASIBLE, STALLED = 5, 6, 7, 8
 FINE = 256.0  # rounding, in units of eps of the grasp's dtype, that forces and costs may show
 ENDS = 4096.0  # eps of float64: what both ends of a bracket may lack
 NEARBY = 64.0  # eps: how far numbers may lie of which a proof to rounding speaks
-CLOSE = 1e-6  # relative gap that OPTIMAL may leave
+CLOSE = {8: 1e-6, 4: 2e-3}  # relative gap that OPTIMAL may leave, by the bytes of a number
 
 
 class Claim(NamedTuple):
@@ -72,11 +72,12 @@ def prove_forces(grasp, answer, problem, tolerance: float | None = None) -> Proo
     with np.errstate(all="ignore"):
         posed = force_problem(grasp, problem)
         asked, claim = posed.asked, _claim(posed, answer)
-        eps = float(np.finfo(np.dtype(grasp.position.dtype)).eps)
+        dtype = np.dtype(grasp.position.dtype)
+        eps, close = float(np.finfo(dtype).eps), CLOSE[dtype.itemsize] if tolerance is None else tolerance
         smoothing = getattr(answer, "smoothing", 0.0)
         if not isinstance(smoothing, int | float) or not 0 <= smoothing < np.inf:
             raise Malformed("smoothing")
-        level, shown = _held(posed, claim, eps, CLOSE if tolerance is None else tolerance, smoothing)
+        level, shown = _held(posed, claim, eps, close, smoothing)
         lost = asked.valid & (claim.status == INFEASIBLE) & (claim.lower == np.inf) & (claim.upper == np.inf)
         lost &= (claim.s == 0).all((-1, -2))
         out, off = prove_separation(

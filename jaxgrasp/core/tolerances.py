@@ -18,6 +18,7 @@ __all__ = [
     "largest_response",
     "pivot_tolerance",
     "perturbation_tolerance",
+    "proven_gap",
     "proven_limit",
     "rank_tolerance",
     "rounding_constant",
@@ -132,6 +133,14 @@ def load_limit(dtype) -> float:
     Their squares neither over- nor underflow.
     """
     return 2.0 ** (np.finfo(jnp.dtype(dtype)).maxexp // 2 - 2)
+
+
+def proven_gap(dtype) -> float:
+    """The relative gap that OPTIMAL may leave with all rounding of its bound allowed for: 5e-7 (float64), 1e-3 (float32).
+
+    Half of what the checker accepts.
+    """
+    return 5e-7 if jnp.dtype(dtype).itemsize == 8 else 1e-3
 
 
 def proven_limit(dtype) -> float:

@@ -18,6 +18,7 @@ from ..conic import (
     ConvexPoint,
     ConvexState,
     cone_max,
+    cone_min,
     cone_sum,
     inner,
     interior_distance,
@@ -27,12 +28,17 @@ from ..conic import (
     vector_norm,
 )
 from ..contacts import Folded, to_body, to_twist, unfold
-from ..core import Array, Status, edge_tolerance, first_of, nan_where, proven_limit, unit_roundoff
+from ..core import Array, Status, edge_tolerance, first_of, nan_where, proven_gap, proven_limit, unit_roundoff
 from .bounds import criterion_value, dual_value
 from .infeasibility import proven_separation
 from .problem import ForceProblem, Load
 
 __all__ = ["Answer", "answer"]
+
+
+BARRED = (
+    1024  # units of rounding, of the largest force: nearer to its cone's edge no barrier can be evaluated
+)
 
 
 class Answer(NamedTuple):
@@ -115,16 +121,28 @@ def _violation(program: ConvexConeProgram, u: Cone) -> Array:
 
 
 @stage
+def _depth(program: ConvexConeProgram, u: Cone) -> Array:
+    """How far u is inside the cones, relative to the largest force (L,)."""
+    largest = cone_max(program.exists * jnp.abs(u[0]))
+    inside = interior_distance(u)
+    least = cone_min(jnp.where(program.exists > 0, inside, jnp.full_like(inside, jnp.inf)))
+    return least / jnp.where(largest > 0, largest, jnp.ones_like(largest))
+
+
+@stage
 def _status(
-    lanes: Lanes, values: Values, proofs: Proofs, violation: Array, smoothing: Array | None,
-    tolerance: Array, edge: float,
+    lanes: Lanes, values: Values, proofs: Proofs, admissible: Array, smoothing: Array | None,
+    tolerance: Array,
 ) -> Array:  # fmt: skip
     cost, bound = values.cost, values.bound - values.rounding
-    tight = (cost - bound) <= tolerance * jnp.maximum(values.scale, jnp.abs(cost))
+    scale = jnp.maximum(values.scale, jnp.abs(cost))
+    tight = (cost - bound) <= tolerance * scale
+    loosest = jnp.maximum(tolerance, jnp.full_like(tolerance, proven_gap(cost.dtype)))
+    tight = tight & ((cost - values.bound + values.stored) <= loosest * scale)
     if smoothing is not None:  # the answer is a point of the central path, at a gap of its own
         tight = lanes.stop == Status.CONVERGED.value
     finite = jnp.isfinite(cost) & jnp.isfinite(bound)
-    optimal = (violation <= edge) & tight & finite & (lanes.stop != Status.SKIPPED.value)
+    optimal = admissible & tight & finite & (lanes.stop != Status.SKIPPED.value)
     return first_of(
         [
             (~lanes.valid, Status.INVALID),
@@ -150,16 +168,23 @@ def answer(problem: ForceProblem, state: ConvexState, tolerance: Array) -> Answe
     found = Multipliers(rows, ray, to_twist(projection, rows[:m]), to_twist(projection, ray[:m]))
     values = _values(problem, state.point, u, found)
     load = load._replace(rest=load.rest & (problem.demand.criterion.barrier_weight is None))
+    admissible = (_violation(program, u) <= edge_tolerance(dtype)) & jnp.isfinite(values.cost) & ~load.off
+    if problem.demand.criterion.barrier_weight is not None:
+        admissible = admissible & (_depth(program, u) >= BARRED * unit_roundoff(dtype))
     status = _status(
         Lanes(problem.valid, load.off, load.rest, state.stop),
         values,
         _proofs(problem, found),
-        _violation(program, u),
+        admissible,
         program.smoothing,
         tolerance,
-        edge_tolerance(dtype),
     )
-    return _in_user_units(problem._replace(load=load), status, u, values, found)
+    # What forces outside their limits cost bounds nothing; beside them no multipliers are to be trusted.
+    known = values._replace(
+        cost=jnp.where(admissible | load.rest, values.cost, jnp.inf),
+        stored=jnp.where(admissible | load.rest, values.stored, jnp.inf),
+    )
+    return _in_user_units(problem._replace(load=load), status, u, known, found)
 
 
 def _values(problem: ForceProblem, point: ConvexPoint, u: Cone, found: Multipliers) -> Values:

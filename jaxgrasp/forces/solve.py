@@ -56,8 +56,9 @@ class OptimalForces(Answer):
     status        int32, a ``Status``: OPTIMAL, INFEASIBLE, STALLED or INVALID
     force         (*batch, k n) contact after contact in the chapter's component order: they balance the load, each in
                   its cone; zero where INFEASIBLE. ``jg.force_vectors`` gives them in body or world axes
-    lower, upper  the optimal cost lies between them: ``upper`` is the criterion at ``force``, ``lower`` a proven lower
-                  bound of every admissible force's cost; both infinite where INFEASIBLE
+    lower, upper  the optimal cost lies between them: ``upper`` is the criterion at ``force``, infinite where the forces
+                  of a STALLED lane are outside their limits; ``lower`` a proven lower bound of every admissible force's
+                  cost; both infinite where INFEASIBLE
     escape_twist  (*batch, m) (velocity; angular velocity), unit norm: the proof of INFEASIBLE; else zero
     load_twist    (*batch, m) derivative of the optimal cost with respect to the wrench: the twist behind ``lower``
     joint_rates   (*batch, q) multipliers of the torque limits; with them the twists prove what they prove
