@@ -115,6 +115,8 @@ class Tally(NamedTuple):
     marginal: int = 0
     undecided: int = 0
     earnest: int = 0
+    exactly: int = 0
+    to_rounding: int = 0
     refused: int = 0
     refused_marginal: int = 0
     contradicted: int = 0
@@ -130,7 +132,8 @@ def tally(grasp: jg.Grasp) -> Tally:
     lower, upper = np.asarray(answer.lower, np.float64), np.asarray(answer.upper, np.float64)
     near_zero = np.minimum(np.abs(lower), np.abs(upper)) <= EARNEST
     near_zero |= (lower < 0) & (upper > 0) & (np.abs(lower) <= EARNEST)
-    accepted = np.asarray(jg.check(grasp, answer))
+    proof = jg.prove(grasp, answer).status
+    accepted = proof != jg.Status.REFUSED
     contradicted = 0
     if grasp.dtype == np.float32:
         exact = jg.wrench_resistance(
@@ -146,6 +149,8 @@ def tally(grasp: jg.Grasp) -> Tally:
         int(marginal.sum()),
         int(undecided.sum()),
         int((undecided & ~near_zero).sum()),
+        int((proof == jg.Status.PROVED_EXACTLY).sum()),
+        int((proof == jg.Status.PROVED_TO_ROUNDING).sum()),
         int((~accepted).sum()),
         int((~accepted & marginal).sum()),
         contradicted,

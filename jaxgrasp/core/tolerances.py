@@ -136,7 +136,7 @@ def load_limit(dtype) -> float:
 
 
 def proven_gap(dtype) -> float:
-    """The relative gap that OPTIMAL may leave with all rounding of its bound allowed for: 5e-7 (float64), 1e-3 (float32).
+    """The relative gap OPTIMAL may leave with all rounding of its bound allowed for: 5e-7 (float64), 1e-3 (float32).
 
     Half of what the checker accepts.
     """
