@@ -77,7 +77,10 @@ def main() -> None:
                 runs = [
                     measure(name, limits, criterion, options.count, seed) for seed in range(options.seeds)
                 ]
-                total, seconds = sum(run[0] for run in runs), float(np.median([run[1] for run in runs]))
+                total, seconds = (
+                    np.sum([run[0] for run in runs], axis=0),
+                    float(np.median([run[1] for run in runs])),
+                )
                 title = f"{name}, {criterion}{', limits' if limits else ''}"
                 for row, rank in zip(total, ("full", "not full"), strict=True):
                     text = " | ".join(str(x) for x in row)
