@@ -47,7 +47,7 @@ def number(value):
     parts, total = value if isinstance(value, list) else [value], Q(0)
     require(len(parts) <= MOST_PARTS, "a number of too many parts")
     for part in parts:
-        require(isinstance(part, str) and NUMBER.fullmatch(part), f"no hexadecimal float: {str(part)[:40]!r}")
+        require(isinstance(part, str) and NUMBER.fullmatch(part), f"no hexadecimal float: {ascii(part)[:40]}")
         try:
             total += Q(float.fromhex(part))
         except OverflowError:

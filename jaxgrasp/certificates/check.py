@@ -56,7 +56,8 @@ def prove(
                    for forces: the problem, exactly as ``optimize_forces`` was asked; wrench and criterion are required.
                    What is proved is this problem, whatever the answer was made for
     tolerance      for verdicts: the |t*| that MARGINAL may claim; by default what the answer's own bracket claims, as
-                   long as that is below 1e-3. For forces: the relative gap that OPTIMAL may leave, by default 1e-6.
+                   long as that is below 1e-3. For forces: the relative gap that OPTIMAL may leave, by default 1e-6;
+                   answers that were smoothed on purpose need more.
                    For epsilon: the rounding its bounds may show, by default 1e-9 of epsilon
 
     PROVED_EXACTLY      true of the very numbers given (as float64), in real arithmetic, with zero tolerance
@@ -100,6 +101,6 @@ def check(
 
 def _problem_shape(grasp, problem: SimpleNamespace) -> tuple[int, ...]:
     """Axes of the grasps, and of the loads after them."""
-    batch = grasp.position.shape[:-2]
+    batch = tuple(grasp.position.shape[:-2])
     lead = np.shape(problem.wrench)[:-1] if problem.wrench is not None else ()
-    return tuple(lead) if len(lead) > len(batch) else tuple(batch)
+    return (*batch, *lead[len(batch) :])

@@ -35,6 +35,7 @@ INVALID, OPTIMAL, INFEASIBLE, STALLED = 5, 6, 7, 8
 FINE = 256.0  # rounding, in units of eps of the grasp's dtype, that forces and costs may show
 ENDS = 4096.0  # eps of float64: what both ends of a bracket may lack
 NEARBY = 64.0  # eps: how far numbers may lie of which a proof to rounding speaks
+BLURRED = 1e-9  # of the cost: what rounding of forces near the edge may do to it in float64
 CLOSE = 1e-6  # relative gap that OPTIMAL may leave
 
 
@@ -73,8 +74,7 @@ def prove_forces(grasp, answer, problem, tolerance: float | None = None) -> Proo
         posed = force_problem(grasp, problem)
         asked, claim = posed.asked, _claim(posed, answer)
         eps = float(np.finfo(np.dtype(grasp.position.dtype)).eps)
-        smoothing = float(getattr(answer, "smoothing", 0.0) or 0.0)
-        level, shown = _held(posed, claim, eps, CLOSE if tolerance is None else tolerance, smoothing)
+        level, shown = _held(posed, claim, eps, CLOSE if tolerance is None else tolerance)
         lost = asked.valid & (claim.status == INFEASIBLE) & (claim.lower == np.inf) & (claim.upper == np.inf)
         lost &= (claim.s == 0).all((-1, -2))
         out, off = prove_separation(
@@ -92,20 +92,27 @@ def prove_forces(grasp, answer, problem, tolerance: float | None = None) -> Proo
     return Proof(*(x.reshape(posed.shape) for x in (LEVELS[level], distance, lower, upper, moved)))
 
 
+def _in_units(value: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """``value / unit``; NaN where a finite number becomes an infinite one, which says something else."""
+    scaled = value / unit
+    return np.where(np.isinf(scaled) & np.isfinite(value), np.nan, scaled)
+
+
 def _claim(posed: ForceProblem, answer) -> Claim:
     asked, said = posed.asked, Fields(answer, posed.shape)
     k, n = asked.known.scale.shape[1:]
     m, q = asked.load.shape[-1], asked.torque.shape[-1]
     force = said.numbers("force", k * n).reshape(-1, k, n) / posed.unit[:, None, None]
-    force = np.where(asked.known.live[..., None], force, 0.0)
+    # What does not exist presses nothing; an answer that says otherwise is refused.
+    force = np.where(asked.known.live[..., None] | (force == 0) | ~asked.valid[:, None, None], force, np.nan)
     # A squared cost has multipliers in units of force, the others have none.
     back = np.where(posed.cost_unit == posed.unit, 1.0, posed.unit)[:, None]
     length = asked.known.length
     return Claim(
         said.numbers("status"),
         scaled_force(force, asked.known.scale, asked.known.normal_index),
-        said.numbers("upper") / posed.cost_unit,
-        said.numbers("lower") / posed.cost_unit,
+        _in_units(said.numbers("upper"), posed.cost_unit),
+        _in_units(said.numbers("lower"), posed.cost_unit),
         scaled_twist(said.numbers("load_twist", m), length, asked.dimension) / back,
         scaled_twist(said.numbers("escape_twist", m), length, asked.dimension),
         said.numbers("joint_rates", q) / back,
@@ -113,23 +120,23 @@ def _claim(posed: ForceProblem, answer) -> Claim:
     )
 
 
-def _held(
-    posed: ForceProblem, claim: Claim, eps: float, tolerance: float, smoothing: float
-) -> tuple[np.ndarray, Shown]:
+def _held(posed: ForceProblem, claim: Claim, eps: float, tolerance: float) -> tuple[np.ndarray, Shown]:
     """Levels of OPTIMAL and STALLED lanes, and what is proved of their cost."""
     asked, fine = posed.asked, FINE * eps
     value, size = cost(asked, claim.s)
     size = np.maximum(size, np.abs(value))
-    blur = fine * (size + robust_sensitivity(asked, claim.s))
+    # Forces on the edge of a cone have no cost to speak of: what they may blur is bounded.
+    blur = fine * (size + np.minimum(robust_sensitivity(asked, claim.s), max(16.0, BLURRED / fine) * size))
     room = np.maximum(blur, ENDS * EPS * size)
-    limits = 3 * claim.s.shape[1] + 2 * asked.torque.shape[-1]
-    allowed = np.maximum(tolerance * size, 4 * (smoothing / posed.cost_unit) * limits) + 4 * room
+    allowed = tolerance * size + 4 * room
     ordered = asked.valid & (claim.lower <= claim.upper)
     said = np.abs(value - claim.upper) <= blur
 
     def fits(shown: Shown) -> np.ndarray:
         cheap = said & np.isfinite(shown.upper)
-        dear = claim.lower <= shown.lower + room
+        # A lower end alone must not gain by forces that are far too large.
+        near = np.abs(shown.lower) if asked.weight is None else np.abs(shown.lower) + asked.weight
+        dear = claim.lower <= shown.lower + np.minimum(room, max(fine, ENDS * EPS) * near)
         width = np.maximum(claim.upper, shown.upper) - np.minimum(claim.lower, shown.lower)
         optimal = (claim.status == OPTIMAL) & cheap & dear & (width <= allowed)
         stalled = (claim.status == STALLED) & (dear | (claim.lower == -np.inf))

@@ -21,10 +21,7 @@ class Fields:
 
     def numbers(self, name: str, *own: int) -> np.ndarray:
         """(N, *own) float64. Malformed where the field is not real numbers of shape (*batch, *own)."""
-        try:
-            array = np.asarray(getattr(self.answer, name))
-        except Exception as error:
-            raise Malformed(name) from error
+        array = self.array(name)
         real = array.dtype.kind in "fiu" or (array.dtype.kind == "V" and array.dtype.name == "bfloat16")
         if not real or array.shape != (*self.batch, *own):
             raise Malformed(name)
@@ -32,7 +29,14 @@ class Fields:
 
     def truths(self, name: str) -> np.ndarray:
         """(N,) bool."""
-        array = np.asarray(getattr(self.answer, name, None))
+        array = self.array(name)
         if array.dtype.kind != "b" or array.shape != self.batch:
             raise Malformed(name)
         return array.reshape(-1)
+
+    def array(self, name: str) -> np.ndarray:
+        """The field as it stands; Malformed where it is no array."""
+        try:
+            return np.asarray(getattr(self.answer, name))
+        except Exception as error:
+            raise Malformed(name) from error
