@@ -160,10 +160,11 @@ def rounding_distance(grasp: ExactGrasp, lane: Scaled, xi: np.ndarray, friction:
 
 def _pitch(dimension: int, xi: np.ndarray) -> float:
     """The share of the twist's translation along its own axis, less what the rounding of its numbers makes of it."""
-    turn = float(np.linalg.norm(xi[dimension:]))
-    if dimension == 2 or turn == 0:
+    turn = xi[dimension:]
+    if dimension == 2 or not turn.any():
         return 0.0
-    along = abs(float(xi[:3] @ (xi[3:] / turn)))
+    axis = turn / np.max(np.abs(turn))  # its square may underflow
+    along = abs(float(xi[:3] @ axis)) / float(np.linalg.norm(axis))
     return max(along / float(np.linalg.norm(xi)) - 8 * EPS, 0.0)
 
 

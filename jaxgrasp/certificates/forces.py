@@ -76,7 +76,7 @@ def prove_forces(grasp, answer, problem, tolerance: float | None = None) -> Proo
         eps = float(np.finfo(np.dtype(grasp.position.dtype)).eps)
         level, shown = _held(posed, claim, eps, CLOSE if tolerance is None else tolerance)
         lost = asked.valid & (claim.status == INFEASIBLE) & (claim.lower == np.inf) & (claim.upper == np.inf)
-        lost &= (claim.s == 0).all((-1, -2))
+        lost &= (claim.s == 0).all((-1, -2)) & np.isfinite(claim.escape_rates).all(-1)
         out, off = prove_separation(
             asked, posed.wrench, claim.escape_twist, claim.escape_rates, NEARBY * eps, lost
         )
