@@ -61,7 +61,11 @@ def measure(model, width: int, kind: str, count: int, chunk: int) -> Counter:
         if int(how) != Status.PROVED_EXACTLY:
             continue
         exact = ExactMap(
-            np.asarray(grasp.position[i])[live], np.asarray(grasp.normal[i])[live], mu[i][live], gamma[i][live], names
+            np.asarray(grasp.position[i])[live],
+            np.asarray(grasp.normal[i])[live],
+            mu[i][live],
+            gamma[i][live],
+            names,
         )
         if not exact.full_rank:
             out["no full rank in 70 digits"] += 1
@@ -85,17 +89,24 @@ def main() -> None:
             found = Counter()
             for chunk, kind in enumerate(KINDS):
                 found += measure(model, width, kind, options.count, chunk)
-            rows[f"{model.name}, {model.dimension}d, {width} contacts"] = {name: found[name] for name in COLUMNS}
+            rows[f"{model.name}, {model.dimension}d, {width} contacts"] = {
+                name: found[name] for name in COLUMNS
+            }
             print(rows[f"{model.name}, {model.dimension}d, {width} contacts"], flush=True)
     total = {name: sum(row[name] for row in rows.values()) for name in COLUMNS}
     lines = [f"| grasps | {' | '.join(COLUMNS)} |", "|---" * (len(COLUMNS) + 1) + "|"]
-    lines += [f"| {row} | {' | '.join(str(x) for x in found.values())} |" for row, found in (rows | {"all": total}).items()]
+    lines += [
+        f"| {row} | {' | '.join(str(x) for x in found.values())} |"
+        for row, found in (rows | {"all": total}).items()
+    ]
     text = "\n".join(lines) + "\n"
     print(text)
     if options.markdown:
         options.markdown.write_text(text)
     options.markdown = None
-    write_figures(options, {"jax": jax.__version__, "python": sys.version.split()[0]}, rows=rows | {"all": total})
+    write_figures(
+        options, {"jax": jax.__version__, "python": sys.version.split()[0]}, rows=rows | {"all": total}
+    )
 
 
 if __name__ == "__main__":

@@ -2,10 +2,10 @@
 
     python benchmarks/mutations.py [--json FILE] [--markdown FILE] [--false 2000] [--lanes 40]
 
-Every change of ``tests/tables/damaged_answers.py`` is made to every field of every kind of answer, on new random grasps, until
-``--false`` damaged answers a field are false by clearly more than rounding. What is false is decided without the checker
-(``tests/tables/mutated_kinds.py``). A false answer that is accepted is a hole; what is not false by clearly more is
-counted as still true or undecidable.
+Every change of ``tests/tables/damaged_answers.py`` is made to every field of every kind of answer, on new random
+grasps, until ``--false`` damaged answers a field are false by clearly more than rounding. What is false is decided
+without the checker (``tests/tables/mutated_kinds.py``). A false answer that is accepted is a hole; what is not clearly
+false is counted as still true or undecided.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "tables"))
@@ -28,102 +27,37 @@ from figures import write_figures
 
 jax.config.update("jax_enable_x64", True)
 
+from damaged_answers import Kind, attack, attack_problem, attack_shapes  # noqa: E402
 from force_problems import CRITERIA, problems  # noqa: E402
-from grasps import random_active, random_coefficients, random_contacts  # noqa: E402
-from mutated_kinds import epsilon_kind, force_kind, resistance_kind  # noqa: E402
-from damaged_answers import Kind, changes, malformed, replaced  # noqa: E402
-
-import jaxgrasp as jg  # noqa: E402
+from mutated_kinds import epsilon_kind, force_kind, random_grasps, resistance_kind  # noqa: E402
 
 COLUMNS = ("tried", "false", "refused of the false", "still true or undecided", "of these refused")
-SHARED = ("norm",)
-
-
-def grasps(rng: np.random.Generator, lanes: int, model: str, k: int) -> jg.Grasp:
-    """Random grasps of a contact model: "soft", "hard", "frictionless", "planar"."""
-    dimension = 2 if model == "planar" else 3
-    position, normal, _ = random_contacts(rng, lanes, k, dimension)
-    mu, gamma = random_coefficients(rng, lanes, k)
-    made = {"soft": jg.SoftFinger(mu, gamma), "frictionless": jg.Frictionless(0 * mu)}.get(model, jg.HardFinger(mu))
-    return jg.Grasp(position, normal, made, random_active(rng, lanes, k) if model == "soft" else None)
 
 
 def kinds(seed: int, lanes: int) -> Iterator[tuple[str, Kind]]:
     """Names of the rows, and the answers to be damaged."""
     rng = np.random.default_rng(seed)
     for model, k in (("soft", 5), ("hard", 3), ("planar", 4), ("frictionless", 8)):
-        yield "WrenchResistance", resistance_kind(model, grasps(rng, lanes, model, k))
+        yield "WrenchResistance", resistance_kind(model, random_grasps(rng, lanes, model, k))
     for criterion, (_, parameter) in CRITERIA.items():
         for limited in (False, True):
-            grasp, _, wrench, cap, limit = problems("soft" if limited else "planar hard", limited, lanes, seed)
+            grasp, _, wrench, cap, limit = problems(
+                "soft" if limited else "planar hard", limited, lanes, seed
+            )
             name = criterion + (", limits" if limited else "")
             yield f"OptimalForces, {name}", force_kind(name, grasp, wrench, criterion, parameter, cap, limit)
     for norm in ("L1", "Linf"):
-        yield f"EpsilonQuality, {norm}", epsilon_kind("planar", grasps(rng, min(lanes, 40), "planar", 4), norm)
-
-
-def damage(kind: Kind, field: str, rng: np.random.Generator) -> Iterator[tuple[str, Any]]:
-    """The damaged answers of one field."""
-    if field in SHARED:
-        other = {"L1": "Linf", "Linf": "L1"}[getattr(kind.answer, field)]
-        yield "another", replaced(kind.answer, **{field: other})
-        return
-    for name, value in changes(getattr(kind.answer, field), rng):
-        yield name, replaced(kind.answer, **{field: value})
-
-
-def attack(kind: Kind, field: str, rng: np.random.Generator) -> tuple[dict[str, Counter], list[str]]:
-    """Counts by the name of the change; the holes, as text."""
-    counts, holes = {}, []
-    before = kind.check(kind.answer)
-    for name, said in damage(kind, field, rng):
-        changed = getattr(said, field) if field in SHARED else np.asarray(getattr(said, field))
-        if field not in SHARED:
-            old = np.asarray(getattr(kind.answer, field))
-            same = (changed == old) | ((changed != changed) & (old != old))
-            same = same.reshape(len(before), -1).all(-1)
-        else:
-            same = np.zeros(len(before), bool)
-        try:
-            accepted = kind.check(said)
-        except Exception as error:
-            holes.append(f"{kind.name}, {field}, {name}: {type(error).__name__}: {error}")
-            continue
-        false = kind.false(said, field) & ~same & before
-        tried = ~same & before
-        counts[name] = Counter({
-            "tried": int(tried.sum()), "false": int(false.sum()),
-            "refused of the false": int((false & ~accepted).sum()),
-            "still true or undecided": int((tried & ~false).sum()),
-            "of these refused": int((tried & ~false & ~accepted).sum()),
-        })  # fmt: skip
-        holes += [f"{kind.name}, {field}, {name}, lane {i}" for i in np.flatnonzero(false & accepted)]
-    return counts, holes
-
-
-def attack_shapes(kind: Kind, field: str) -> tuple[Counter, list[str]]:
-    """Fields that are none: all lanes refused, nothing raised."""
-    counts, holes = Counter(), []
-    for name, value in [*malformed(getattr(kind.answer, field) if field not in SHARED else "L1"), ("missing", None)]:
-        said = replaced(kind.answer, **{field: value})
-        if name == "missing":
-            object.__delattr__(said, field)
-        counts["tried"] += 1
-        counts["false"] += 1
-        try:
-            refused = not np.any(kind.check(said))
-        except Exception as error:  # a hole like any other
-            refused, name = False, f"{name}: {type(error).__name__}"
-        counts["refused of the false"] += refused
-        holes += [] if refused else [f"{kind.name}, {field}, {name}"]
-    return counts, holes
-
-
+        yield (
+            f"EpsilonQuality, {norm}",
+            epsilon_kind("planar", random_grasps(rng, min(lanes, 40), "planar", 4), norm),
+        )
 
 
 def main() -> None:
     """Attack, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--json", type=Path)
     parser.add_argument("--markdown", type=Path)
     parser.add_argument("--false", type=int, default=2000)
@@ -137,17 +71,17 @@ def main() -> None:
     done: Counter = Counter()
     while seed == 0 or (time.perf_counter() - start < options.seconds and min(done.values()) < options.false):
         for row, kind in kinds(seed, options.lanes):
-            if seed and min(done[row, f] for f in kind.fields) >= options.false:
+            if seed and min(n for (r, _), n in done.items() if r == row) >= options.false:
                 continue
             accepted, status = kind.check(kind.answer), np.asarray(kind.answer.status)
             tally = genuine.setdefault(row, Counter())
             tally.update(lanes=len(status), refused=int((~accepted).sum()))
             tally.update(f"refused with status {s}" for s in status[~accepted])
-            for field in kind.fields:
+            for field in (*kind.fields, *(("problem",) if kind.others else ())):
                 if done[row, field] >= options.false:
                     continue
-                counts, found = attack(kind, field, rng)
-                if not seed:
+                counts, found = attack_problem(kind) if field == "problem" else attack(kind, field, rng)
+                if not seed and field != "problem":
                     counts["malformed"], more = attack_shapes(kind, field)
                     found += more
                 for name, count in counts.items():
@@ -157,7 +91,10 @@ def main() -> None:
                 print("\n".join(found[:5]), end="\n" if found else "", flush=True)
             print(f"{time.perf_counter() - start:6.0f} s  {row}  {len(holes)} holes", flush=True)
         seed += 1
-    lines = [f"| kind | field | change | {' | '.join(COLUMNS)} |", "| --- " * 3 + "| ---: " * len(COLUMNS) + "|"]
+    lines = [
+        f"| kind | field | change | {' | '.join(COLUMNS)} |",
+        "| --- " * 3 + "| ---: " * len(COLUMNS) + "|",
+    ]
     by_field: dict[tuple[str, str], Counter] = {}
     for (row, field, name), count in rows.items():
         by_field.setdefault((row, field), Counter()).update(count)
@@ -166,15 +103,21 @@ def main() -> None:
     short += [f"| {r} | {f} | {' | '.join(str(c[x]) for x in COLUMNS)} |" for (r, f), c in by_field.items()]
     untouched = [f"- {row}: {dict(count)}" for row, count in genuine.items()]
     text = "\n".join(
-        ["# Damaged answers", "", "`python benchmarks/mutations.py`", "", *short, "", "Genuine answers:", "", *untouched,
-         "", f"False answers accepted: {len(holes)}", "", *(f"- {h}" for h in holes[:200]), "", *lines]
+        ["# Damaged answers", "", "`python benchmarks/mutations.py`", "", *short, "", "Genuine answers:", "",
+         *untouched, "", f"False answers accepted: {len(holes)}", "", *(f"- {h}" for h in holes[:200]), "", *lines]
     )  # fmt: skip
     print("\n".join(short + untouched + holes[:50]))
     if options.markdown:
         options.markdown.write_text(text + "\n")
     options.markdown = None
     table = [{"kind": r, "field": f, "change": n, **c} for (r, f, n), c in rows.items()]
-    write_figures(options, {"jax": jax.__version__, "python": sys.version.split()[0]}, rows=table, genuine=genuine, holes=holes)
+    write_figures(
+        options,
+        {"jax": jax.__version__, "python": sys.version.split()[0]},
+        rows=table,
+        genuine=genuine,
+        holes=holes,
+    )
 
 
 if __name__ == "__main__":

@@ -116,7 +116,10 @@ class _Lane:
             level, distance = self._escapes() if upper == 0 else (0, np.inf)
             return (level, distance, 0.0, 0.0) if level else nothing
         direction = claim.direction[lane] / length
-        top, terms = self._support(direction), float((np.abs(self.blocks).sum((0, 2)) * np.abs(direction)).sum())
+        top, terms = (
+            self._support(direction),
+            float((np.abs(self.blocks).sum((0, 2)) * np.abs(direction)).sum()),
+        )
         if not top <= upper * (1 + self.room) + 16 * self.eps * terms:
             return nothing
         if status == RESISTANT and lower > 0:
@@ -165,7 +168,10 @@ class _Lane:
         """``direction`` turned round is a twist that shows a margin of 0, neither clearly more nor clearly less."""
         xi = -self.claim.direction[self.lane] * self.row_scale
         x = np.einsum("kmn,m->kn", self.known.blocks[self.lane], xi)[self.live]
-        total, least = float(x[:, 0].sum()), len(x) * float((x[:, 0] - np.linalg.norm(x[:, 1:], axis=-1)).min())
+        total, least = (
+            float(x[:, 0].sum()),
+            len(x) * float((x[:, 0] - np.linalg.norm(x[:, 1:], axis=-1)).min()),
+        )
         # t* <= -least / (total - least), see ``exact_twist``.
         return total > 0 and abs(least) < LARGEST_CLAIM * (total - least)
 

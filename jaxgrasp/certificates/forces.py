@@ -129,7 +129,8 @@ def _held(posed: ForceProblem, claim: Claim, eps: float, tolerance: float) -> tu
     blur = fine * (size + np.minimum(robust_sensitivity(asked, claim.s), max(16.0, BLURRED / fine) * size))
     room = np.maximum(blur, ENDS * EPS * size)
     allowed = tolerance * size + 4 * room
-    ordered = asked.valid & (claim.lower <= claim.upper)
+    # Where squares overflow nothing is compared.
+    ordered = asked.valid & (claim.lower <= claim.upper) & np.isfinite(blur)
     said = np.abs(value - claim.upper) <= blur
 
     def fits(shown: Shown) -> np.ndarray:
@@ -188,7 +189,8 @@ def _admissible(asked: Asked, s: np.ndarray, fine: float) -> np.ndarray:
     rooms, edge = edges_of(asked, s), fine * total[:, None]
     reach = np.linalg.norm(asked.scaled_jacobian(), axis=(1, 2)) * total[:, None]
     return (
-        (np.linalg.norm(applied + asked.load, axis=-1) <= fine * size)
+        np.isfinite(total + size)
+        & (np.linalg.norm(applied + asked.load, axis=-1) <= fine * size)
         & (rooms.cone >= -edge).all(-1)
         & (rooms.cap >= -edge).all(-1)
         & (rooms.torque >= -fine * (reach + np.where(np.isfinite(asked.torque), asked.torque, 0.0))).all(-1)

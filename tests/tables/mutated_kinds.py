@@ -5,18 +5,22 @@ Every judgement asks for a clear difference (``CLEAR``), so that what is called 
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from exact_margin import ExactMap
-from force_oracle import clarabel_forces, folded_map, log_det_terms
 from damaged_answers import CLEAR, Kind
+from exact_margin import ExactMap
+from force_oracle import folded_map
+from force_problems import CRITERIA as PARAMETERS
+from force_problems import problems
+from force_truth import ForceTruth, coefficients_of, components_of
+from grasps import random_active, random_coefficients, random_contacts
 from scipy.spatial import ConvexHull, QhullError
 
 import jaxgrasp as jg
 
-__all__ = ["epsilon_kind", "force_kind", "resistance_kind"]
+__all__ = ["epsilon_kind", "force_kind", "kind_of", "random_grasps", "resistance_kind"]
 
 RESISTANT, NOT_RESISTANT, MARGINAL, UNDECIDED, INVALID, OPTIMAL, INFEASIBLE = 1, 2, 3, 4, 5, 6, 7
 
@@ -29,19 +33,11 @@ def _numpy(answer: Any) -> Any:
     return out
 
 
-def _components(grasp: jg.Grasp) -> list[str]:
-    return [c.value for c in grasp.model.components(grasp.dimension)]
-
-
-def _coefficients(grasp: jg.Grasp) -> tuple[np.ndarray, np.ndarray]:
-    return np.asarray(grasp.model.friction_coefficient), np.asarray(grasp.model.torsion_coefficient)
-
-
 def _exact_maps(grasp: jg.Grasp) -> list[ExactMap]:
-    mu, gamma = _coefficients(grasp)
+    mu, gamma = coefficients_of(grasp)
     p, n, live = (np.asarray(x) for x in (grasp.position, grasp.normal, grasp.active))
     return [
-        ExactMap(p[i][live[i]], n[i][live[i]], mu[i][live[i]], gamma[i][live[i]], _components(grasp))
+        ExactMap(p[i][live[i]], n[i][live[i]], mu[i][live[i]], gamma[i][live[i]], components_of(grasp))
         for i in range(len(p))
     ]
 
@@ -67,16 +63,29 @@ def resistance_kind(name: str, grasp: jg.Grasp) -> Kind:
             wrong |= (code == NOT_RESISTANT) & full & (low > CLEAR)
             return wrong | ((code == MARGINAL) & ((low > 1e-3 + CLEAR) | (high < -1e-3 - CLEAR)))
         if field == "rank":
-            return (said.rank != answer.rank) & (full | (said.rank > np.array([m.A.shape[0] for m in maps])) | (said.rank < 1))
+            return (said.rank != answer.rank) & (
+                full | (said.rank > np.array([m.A.shape[0] for m in maps])) | (said.rank < 1)
+            )
         if field == "lower":
-            return full & (np.isnan(lower) | (lower > high + CLEAR * np.maximum(1, np.abs(high))) | (lower > upper + CLEAR))
+            return full & (
+                np.isnan(lower)
+                | (lower > high + CLEAR * np.maximum(1, np.abs(high)))
+                | (lower > upper + CLEAR)
+            )
         if field == "upper":
-            return full & (np.isnan(upper) | (upper < low - CLEAR * np.maximum(1, np.abs(low))) | (upper < lower - CLEAR))
+            return full & (
+                np.isnan(upper) | (upper < low - CLEAR * np.maximum(1, np.abs(low))) | (upper < lower - CLEAR)
+            )
         if field == "internal_force":
             with np.errstate(all="ignore"):
-                shown = np.array([float(m.lower(of_lane(said.internal_force, i))) for i, m in enumerate(maps)])
+                shown = np.array(
+                    [float(m.lower(of_lane(said.internal_force, i))) for i, m in enumerate(maps)]
+                )
             needs = full & (np.isfinite(lower) | (said.status == RESISTANT))
-            return needs & ((shown < lower - CLEAR * (1 + np.abs(lower))) | ((said.status == RESISTANT) & (shown < -CLEAR)))
+            return needs & (
+                (shown < lower - CLEAR * (1 + np.abs(lower)))
+                | ((said.status == RESISTANT) & (shown < -CLEAR))
+            )
         if field == "bound_twist":
             shown = np.array([float(m.upper(said.bound_twist[i])) for i, m in enumerate(maps)])
             return full & (shown > upper + CLEAR * (1 + np.abs(upper))) & (upper < 1 - CLEAR)
@@ -93,90 +102,22 @@ CRITERIA = {
 }  # fmt: skip
 
 
-class _Forces:
-    """One force problem a lane, in numpy: balance, limits and cost of any forces."""
-
-    def __init__(self, grasp: jg.Grasp, wrench, criterion: str, parameter, cap, limits):
-        self.criterion, self.parameter, self.wrench, self.cap, self.limits = criterion, parameter, wrench, cap, limits
-        self.components, self.live = _components(grasp), np.asarray(grasp.active)
-        mu, gamma = _coefficients(grasp)
-        self.mu, self.gamma, self.dimension = mu, gamma, grasp.dimension
-        p, n = np.asarray(grasp.position), np.asarray(grasp.normal)
-        args = [(p[i], n[i], mu[i], gamma[i], self.live[i], self.components, wrench[i]) for i in range(len(p))]
-        extra = [
-            (None if cap is None else cap[i], None if limits is None else (limits[0][i], limits[1][i]))
-            for i in range(len(p))
-        ]
-        solved = [clarabel_forces(*a, criterion, parameter, *e) for a, e in zip(args, extra, strict=True)]
-        self.optimal = np.array([s[0] == "optimal" for s in solved])
-        self.infeasible = np.array([s[0] == "infeasible" for s in solved])
-        self.best = np.array([s[1] if s[0] == "optimal" else np.nan for s in solved])
-        self.maps = [folded_map(p[i], n[i], mu[i], gamma[i], self.components) for i in range(len(p))]
-
-    def scaled(self, force: np.ndarray, i: int) -> np.ndarray:
-        """s (k, n), normal first."""
-        by_name = {"f_x": self.mu[i], "f_y": self.mu[i], "f_n": np.ones_like(self.mu[i]), "tau_n": self.gamma[i]}
-        f = force.reshape(len(self.mu[i]), -1)
-        columns = {c: np.where(f[:, j] == 0, 0.0, f[:, j] / by_name[c]) for j, c in enumerate(self.components)}
-        return np.stack([columns.pop("f_n"), *columns.values()], -1)
-
-    def broken(self, force: np.ndarray, i: int) -> bool:
-        """Whether forces miss the balance, a cone or a limit clearly."""
-        s = self.scaled(force, i)
-        if not np.isfinite(s).all() or s[~self.live[i]].any():
-            return True
-        blocks, length = self.maps[i]
-        d, w = self.dimension, self.wrench[i]
-        load = np.concatenate([w[:d], w[d:] / length])
-        size = np.linalg.norm(s) + np.linalg.norm(load)
-        applied = np.einsum("kmn,kn->m", blocks, s) + load
-        tight = CLEAR * 10 * size
-        off = np.linalg.norm(applied) > tight * (1 + np.linalg.norm(blocks))
-        off |= bool((np.linalg.norm(s[:, 1:], axis=-1) > s[:, 0] + tight)[self.live[i]].any())
-        if self.cap is not None:
-            off |= bool((s[:, 0] > self.cap[i] + tight)[self.live[i]].any())
-        if self.limits is not None:
-            jacobian, torque = self.limits[0][i], self.limits[1][i]
-            wide = np.abs(jacobian).sum(0) * tight + CLEAR * torque
-            off |= bool((np.abs(jacobian.T @ force) > torque + wide).any())
-        return bool(off)
-
-    def cost(self, force: np.ndarray, i: int) -> float:
-        """The criterion at any forces; NaN where it has none."""
-        s, live = self.scaled(force, i), self.live[i]
-        f = force.reshape(len(live), -1)
-        if self.criterion == "gentlest":
-            return s[live, 0].max()
-        if self.criterion == "smallest sum":
-            return s[live, 0].sum()
-        if self.criterion == "sum of squares":
-            return (s[live, 0] ** 2).sum()
-        if self.criterion == "least norm":
-            scale = [self.parameter if c == "tau_n" else 1.0 for c in self.components]
-            return ((f[live] / scale) ** 2).sum()
-        logs = 0.0
-        for j in np.flatnonzero(live):
-            a, b, c = log_det_terms(self.mu[i, j], self.components, self.dimension)
-            head, tail = s[j, 0], np.linalg.norm(s[j, 1:])
-            if head <= 0 or (b and head <= tail):
-                return np.nan
-            logs += a * np.log(head) + (b * np.log((head - tail) * (head + tail)) if b else 0.0) + c
-        return s[live, 0].max() - self.parameter * logs
-
-
-def force_kind(name: str, grasp: jg.Grasp, wrench, criterion: str, parameter=None, cap=None, limits=None) -> Kind:
+def force_kind(
+    name: str, grasp: jg.Grasp, wrench, criterion: str, parameter=None, cap=None, limits=None
+) -> Kind:
     """Forces; the optimum by Clarabel, balance, cones and cost by numpy."""
     made = CRITERIA[criterion]() if parameter is None else CRITERIA[criterion](parameter)
     asked = {"criterion": made, "max_normal": cap, "torque_limits": limits}
     answer = _numpy(jg.optimize_forces(grasp, wrench, **asked))
-    posed = _Forces(grasp, wrench, criterion, parameter, cap, limits)
+    posed = ForceTruth(grasp, wrench, criterion, parameter, cap, limits)
     best = posed.best
     with np.errstate(all="ignore"):
-        size = np.maximum(np.abs(best), 1e-3) + (10 * parameter if criterion == "robust" else 0.0)
+        known = np.where(np.isfinite(best), best, np.where(np.isfinite(answer.upper), answer.upper, 1.0))
+        size = np.maximum(np.abs(known), 1e-3) + (10 * parameter if criterion == "robust" else 0.0)
     homogeneous = criterion in ("gentlest", "smallest sum")
 
     def gain(said: Any, twist: np.ndarray) -> np.ndarray:
-        """Work of the load less what the joints can do; of an escape twist, without the joints where that shows more."""
+        """Work of the load less what the joints can do; along an escape twist, without the joints."""
         value = np.sum(twist * wrench, -1)
         if twist is said.escape_twist:
             return np.where(np.isfinite(said.joint_rates).all(-1), value, np.nan)
@@ -202,7 +143,11 @@ def force_kind(name: str, grasp: jg.Grasp, wrench, criterion: str, parameter=Non
             if field == "force":
                 costs = np.array([posed.cost(said.force[i], i) for i in range(n)])
                 broken = np.array([posed.broken(said.force[i], i) for i in range(n)])
-                return np.where(lost, (said.force != 0).any(-1), optimal & (broken | ~(np.abs(costs - upper) <= 10 * CLEAR * size)))
+                return np.where(
+                    lost,
+                    (said.force != 0).any(-1),
+                    optimal & (broken | ~(np.abs(costs - upper) <= 10 * CLEAR * size)),
+                )
             if field == "escape_twist":
                 work = gain(said, said.escape_twist)
                 return lost & ~(work > 0)
@@ -210,23 +155,65 @@ def force_kind(name: str, grasp: jg.Grasp, wrench, criterion: str, parameter=Non
             shown = gain(said, said.load_twist)
             if field == "joint_rates":
                 shown = np.where(lost, gain(said, said.escape_twist), shown)
-                return (lost & ~(shown > 0)) | (optimal & (criterion != "robust") & (lower > CLEAR * size) & ~(shown > 0))
+                return (lost & ~(shown > 0)) | (
+                    optimal & (criterion != "robust") & (lower > CLEAR * size) & ~(shown > 0)
+                )
             if criterion == "robust":
                 return optimal & ~np.isfinite(said.load_twist).all(-1)
             least = np.zeros(n) if homogeneous else lower - 10 * CLEAR * size
             return optimal & (lower > 10 * CLEAR * size) & ~(shown > least)
 
-    fields = ("status", "force", "lower", "upper", "load_twist", "escape_twist", *(("joint_rates",) if limits else ()))
-    return Kind(f"OptimalForces, {name}", answer, fields, partial(jg.check, grasp, wrench=wrench, **asked), says_false)
+    fields = (
+        "status",
+        "force",
+        "lower",
+        "upper",
+        "load_twist",
+        "escape_twist",
+        *(("joint_rates",) if limits else ()),
+    )
+    check, others = partial(jg.check, grasp), []
+    optimal, tight = answer.status == OPTIMAL, 10 * CLEAR * size
+    for what, load in (
+        ("load times 1.01", 1.01 * wrench), ("load turned round", -wrench),
+        ("load of another lane", np.roll(wrench, 1, 0)),
+        ("load plus 0.1", wrench + 0.1), ("no load", 0 * wrench), ("load times 1e100", 1e100 * wrench),
+    ):  # fmt: skip
+        posed.wrench = load
+        broken = np.array([posed.broken(answer.force[i], i) for i in range(len(best))])
+        others.append((what, partial(check, wrench=load, **asked), optimal & broken))
+    posed.wrench = wrench
+    for other in CRITERIA:
+        posed.criterion, posed.parameter = other, 0.2
+        costs = np.array([posed.cost(answer.force[i], i) for i in range(len(best))])
+        problem = asked | {
+            "criterion": CRITERIA[other](0.2) if other in ("robust", "least norm") else CRITERIA[other]()
+        }
+        wrong = optimal & ~(np.abs(costs - answer.upper) <= tight)
+        others.append((f"criterion {other}", partial(check, wrench=wrench, **problem), wrong))
+    posed.criterion, posed.parameter = criterion, parameter
+    return Kind(
+        f"OptimalForces, {name}",
+        answer,
+        fields,
+        partial(check, wrench=wrench, **asked),
+        says_false,
+        tuple(others),
+    )
 
 
 def epsilon_kind(name: str, grasp: jg.Grasp, norm: str) -> Kind:
     """Epsilon; its lower bound by Qhull, its upper by the support function, its verdict by 70 digits."""
     answer = _numpy(jg.epsilon_quality(grasp, norm=norm, certificate=True))
     verdict = resistance_kind(name, grasp)
-    parts = _components(grasp)
-    mu, gamma = _coefficients(grasp)
-    p, n, live, d = np.asarray(grasp.position), np.asarray(grasp.normal), np.asarray(grasp.active), grasp.dimension
+    parts = components_of(grasp)
+    mu, gamma = coefficients_of(grasp)
+    p, n, live, d = (
+        np.asarray(grasp.position),
+        np.asarray(grasp.normal),
+        np.asarray(grasp.active),
+        grasp.dimension,
+    )
     lanes = range(len(p))
     maps = [folded_map(p[i], n[i], mu[i], gamma[i], parts) for i in lanes]
 
@@ -278,7 +265,12 @@ def epsilon_kind(name: str, grasp: jg.Grasp, norm: str) -> Kind:
                 wrong = verdict.false(said, "status") | ((status == NOT_RESISTANT) & (upper > 0))
                 return wrong | ((status == RESISTANT) & (lower <= 0))
             if field in ("lower", "upper"):
-                wrong = np.isnan(lower + upper) | (lower > upper * (1 + CLEAR)) | (lower > high * (1 + CLEAR)) | (lower < 0)
+                wrong = (
+                    np.isnan(lower + upper)
+                    | (lower > upper * (1 + CLEAR))
+                    | (lower > high * (1 + CLEAR))
+                    | (lower < 0)
+                )
                 wrong |= upper < low * (1 - CLEAR)
                 return wrong | ((status == NOT_RESISTANT) & ((lower != 0) | (upper != 0)))
             out = np.zeros(len(status), bool)
@@ -293,13 +285,41 @@ def epsilon_kind(name: str, grasp: jg.Grasp, norm: str) -> Kind:
                 elif field == "touching":
                     out[i] = too_much(i, said.touching[i][None], said.norm)
                 elif field == "forces":
-                    out[i] = yes[i] and (too_much(i, said.forces[i], said.norm) or radius(i, said) < lower[i] * (1 - CLEAR))
+                    out[i] = yes[i] and (
+                        too_much(i, said.forces[i], said.norm) or radius(i, said) < lower[i] * (1 - CLEAR)
+                    )
                 elif field == "facets":
                     out[i] = yes[i] and not closed(i, said.facets[i])
                 elif yes[i]:
-                    out[i] = support(i, said) > upper[i] * (1 + CLEAR) or radius(i, said) < lower[i] * (1 - CLEAR)
+                    out[i] = support(i, said) > upper[i] * (1 + CLEAR) or radius(i, said) < lower[i] * (
+                        1 - CLEAR
+                    )
                     out[i] |= too_much(i, said.forces[i], said.norm)
         return out
 
     fields = ("status", "lower", "upper", "direction", "touching", "forces", "facets", "torque_scale", "norm")
     return Kind(f"EpsilonQuality, {norm}, {name}", answer, fields, partial(jg.check, grasp), says_false)
+
+
+def random_grasps(rng: np.random.Generator, lanes: int, model: str, k: int) -> jg.Grasp:
+    """Random grasps of a contact model: "soft", "hard", "frictionless", "planar"."""
+    dimension = 2 if model == "planar" else 3
+    position, normal, _ = random_contacts(rng, lanes, k, dimension)
+    mu, gamma = random_coefficients(rng, lanes, k)
+    made = {"soft": jg.SoftFinger(mu, gamma), "frictionless": jg.Frictionless(0 * mu)}.get(
+        model, jg.HardFinger(mu)
+    )
+    return jg.Grasp(position, normal, made, random_active(rng, lanes, k) if model == "soft" else None)
+
+
+@cache
+def kind_of(name: str, lanes: int, seed: int = 0) -> Kind:
+    """Few answers of one kind: "verdicts", "epsilon", or a criterion, with ", limits" where there are any."""
+    rng = np.random.default_rng(seed)
+    if name == "verdicts":
+        return resistance_kind("hard", random_grasps(rng, lanes, "hard", 4))
+    if name == "epsilon":
+        return epsilon_kind("planar", random_grasps(rng, lanes, "planar", 4), "L1")
+    criterion = name.removesuffix(", limits")
+    grasp, _, wrench, cap, limit = problems("planar hard", name != criterion, lanes, seed)
+    return force_kind(name, grasp, wrench, criterion, PARAMETERS[criterion][1], cap, limit)
