@@ -61,7 +61,8 @@ def test_large_forces_lend_no_room_to_the_lower_bound(gentlest):
     force = np.asarray(gentlest.force).copy()
     force[[2, 5]] = 1e15
     assert status_of(replaced(gentlest, status=8, force=force, upper=np.inf, lower=10.0)) == REFUSED
-    assert status_of(replaced(gentlest, status=8, force=force, upper=np.inf)) == EXACTLY
+    assert status_of(replaced(gentlest, status=8, upper=np.inf)) == EXACTLY
+    assert status_of(replaced(gentlest, status=8, upper=np.inf, lower=3.001)) == REFUSED
 
 
 @pytest.mark.parametrize("near", [3e-16, 4e-15, 1e-14])

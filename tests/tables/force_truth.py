@@ -56,9 +56,10 @@ class ForceTruth:
             "tau_n": self.gamma[i],
         }
         f = force.reshape(len(self.mu[i]), -1)
-        columns = {
-            c: np.where(f[:, j] == 0, 0.0, f[:, j] / by_name[c]) for j, c in enumerate(self.components)
-        }
+        with np.errstate(all="ignore"):
+            columns = {
+                c: np.where(f[:, j] == 0, 0.0, f[:, j] / by_name[c]) for j, c in enumerate(self.components)
+            }
         return np.stack([columns.pop("f_n"), *columns.values()], -1)
 
     def broken(self, force: np.ndarray, i: int) -> bool:
