@@ -45,6 +45,7 @@ def prove(
     criterion=None,
     max_normal=None,
     torque_limits=None,
+    smoothing: float = 0.0,
     tolerance: float | None = None,
 ) -> Proof:
     """What the evidence in ``answer`` proves, lane by lane: a ``Proof``, the shape of ``answer.status``.
@@ -52,12 +53,12 @@ def prove(
     grasp          a ``Grasp``
     answer         what ``wrench_resistance(grasp)``, ``optimize_forces(grasp, wrench, ..)`` or
                    ``epsilon_quality(grasp, certificate=True)`` returned
-    wrench, criterion, max_normal, torque_limits
+    wrench, criterion, max_normal, torque_limits, smoothing
                    for forces: the problem, exactly as ``optimize_forces`` was asked; wrench and criterion are required.
                    What is proved is this problem, whatever the answer was made for
     tolerance      for verdicts: the |t*| that MARGINAL may claim; by default what the answer's own bracket claims, as
                    long as that is below 1e-3. For forces: the relative gap that OPTIMAL may leave, by default 1e-6
-                   (2e-3 in float32).
+                   (2e-3 in float32), or what smoothing costs.
                    For epsilon: the rounding its bounds may show, by default 1e-9 of epsilon
 
     PROVED_EXACTLY      true of the very numbers given (as float64), in real arithmetic, with zero tolerance
@@ -69,7 +70,7 @@ def prove(
     for forces without wrench and criterion, and for a problem of another shape.
     """
     problem = SimpleNamespace(
-        wrench=wrench, criterion=criterion, max_normal=max_normal, torque_limits=torque_limits
+        wrench=wrench, criterion=criterion, max_normal=max_normal, torque_limits=torque_limits, smoothing=smoothing
     )
     prover = _prover(answer)
     try:
@@ -86,6 +87,7 @@ def check(
     criterion=None,
     max_normal=None,
     torque_limits=None,
+    smoothing: float = 0.0,
     tolerance: float | None = None,
 ) -> np.ndarray:
     """Whether the evidence in ``answer`` proves it, exactly or to rounding: numpy bool, the shape of ``answer.status``.
@@ -94,13 +96,13 @@ def check(
     """
     proof = prove(
         grasp, answer, wrench=wrench, criterion=criterion, max_normal=max_normal,
-        torque_limits=torque_limits, tolerance=tolerance,
+        torque_limits=torque_limits, smoothing=smoothing, tolerance=tolerance,
     )  # fmt: skip
     return (proof.status != REFUSED)[()]
 
 
 def _problem_shape(grasp, problem: SimpleNamespace) -> tuple[int, ...]:
     """Axes of the grasps, and of the loads after them."""
-    batch = grasp.position.shape[:-2]
+    batch = tuple(grasp.position.shape[:-2])
     lead = np.shape(problem.wrench)[:-1] if problem.wrench is not None else ()
-    return tuple(lead) if len(lead) > len(batch) else tuple(batch)
+    return (*batch, *lead[len(batch) :])

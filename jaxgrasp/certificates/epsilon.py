@@ -29,7 +29,7 @@ RESISTANT, NOT_RESISTANT, MARGINAL, UNDECIDED, INVALID = 1, 2, 3, 4, 5
 NORMS = ("L1", "Linf")
 ROOM = 1e-9  # of epsilon; of unit effort
 NEARBY = 64.0  # eps
-NEARLY_NOTHING = 1e-3  # of |A|: what epsilon may be where the margin is 0
+LARGEST_CLAIM = 1e-3  # a margin this far from 0 is not marginal
 
 
 class Claim(NamedTuple):
@@ -72,9 +72,9 @@ def prove_epsilon(grasp, answer, tolerance: float | None = None) -> Proof:
 def _claim(answer, batch: tuple[int, ...], known: Rebuilt, m: int) -> Claim:
     said, (k, n) = Fields(answer, batch), known.scale.shape[1:]
     forces, facets, norm = said.array("forces"), said.array("facets"), getattr(answer, "norm", None)
-    if forces.ndim != len(batch) + 2 or not isinstance(norm, str) or norm not in NORMS:
+    if not isinstance(norm, str) or norm not in NORMS or forces.ndim != len(batch) + 2:
         raise Malformed("forces or norm")
-    if facets.dtype.kind not in "iu" or facets.ndim != len(batch) + 2 or facets.shape[-1] != m:
+    if facets.dtype.kind not in "iu" or facets.shape != (*batch, *facets.shape[-2:-1], m):
         raise Malformed("facets")
     vertices = forces.shape[-2]
     return Claim(
@@ -107,20 +107,25 @@ class _Lane:
         claim, lane, nothing = self.claim, self.lane, (0, np.inf, np.nan, np.nan)
         status, lower, upper = int(claim.status[lane]), float(claim.lower[lane]), float(claim.upper[lane])
         length = float(np.linalg.norm(claim.direction[lane]))
-        sound = claim.scale[lane] > 0 and np.isfinite(self.blocks).all() and np.isfinite(upper)
+        # A size that is a number bounds all that is computed from the scale.
+        sound = 0 < claim.scale[lane] < np.inf and np.isfinite(self.size) and np.isfinite(upper)
         sound = sound and abs(length - 1) <= NEARBY * self.eps and 0 <= lower <= upper
         if not (sound and self._touching_is_possible()):
             return nothing
         if status == NOT_RESISTANT:
             level, distance = self._escapes() if upper == 0 else (0, np.inf)
             return (level, distance, 0.0, 0.0) if level else nothing
-        top = self._support(claim.direction[lane] / length)
-        if top > upper * (1 + self.room) + 16 * self.eps * self.size:
+        direction = claim.direction[lane] / length
+        top, terms = (
+            self._support(direction),
+            float((np.abs(self.blocks).sum((0, 2)) * np.abs(direction)).sum()),
+        )
+        if not top <= upper * (1 + self.room) + 16 * self.eps * terms:
             return nothing
         if status == RESISTANT and lower > 0:
             ball = self._ball()
             return (2, 0.0, ball, top) if ball >= lower * (1 - self.room) else nothing
-        idle = status == UNDECIDED or (status == MARGINAL and upper <= NEARLY_NOTHING * self.size)
+        idle = status == UNDECIDED or (status == MARGINAL and self._nearly_escapes())
         return (2, 0.0, 0.0, top) if idle and lower == 0 else nothing
 
     def _support(self, direction: np.ndarray) -> float:
@@ -158,6 +163,17 @@ class _Lane:
         terms = s.shape[1] * s.shape[2] + 24
         blur = terms * EPS * self.size * float(np.max(np.linalg.norm(s.reshape(len(s), -1), axis=-1)))
         return ball_inside(points, facets) - blur
+
+    def _nearly_escapes(self) -> bool:
+        """``direction`` turned round is a twist that shows a margin of 0, neither clearly more nor clearly less."""
+        xi = -self.claim.direction[self.lane] * self.row_scale
+        x = np.einsum("kmn,m->kn", self.known.blocks[self.lane], xi)[self.live]
+        total, least = (
+            float(x[:, 0].sum()),
+            len(x) * float((x[:, 0] - np.linalg.norm(x[:, 1:], axis=-1)).min()),
+        )
+        # t* <= -least / (total - least), see ``exact_twist``.
+        return total > 0 and abs(least) < LARGEST_CLAIM * (total - least)
 
     def _escapes(self) -> tuple[int, float]:
         """``direction`` as a twist that no contact can oppose, turned round."""

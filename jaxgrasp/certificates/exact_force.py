@@ -21,6 +21,7 @@ from .rebuilt import Rebuilt
 
 __all__ = ["Scaled", "internal_force", "margin_at_least", "scaled_lane"]
 
+LARGEST_CHANGE = 0.5  # of the forces
 BITS = 60  # of a force when it becomes an integer
 STEPS, MORE_BITS = 2, 50  # corrections in floating point, each with so many bits more
 
@@ -122,7 +123,8 @@ def internal_force(grasp: ExactGrasp, lane: Scaled, s: np.ndarray) -> tuple[Forc
     inverse = np.linalg.pinv(lane.A, rcond=1e-15)
     for _ in range(STEPS):
         change = -(inverse @ parts.residual(grasp.wrench(parts.forces())))
-        if not np.isfinite(change).all():
+        # Forces that are mostly no internal ones are no evidence, whatever is left of them.
+        if not np.linalg.norm(change) <= LARGEST_CHANGE * np.linalg.norm(s / size):
             return None
         parts.finer(MORE_BITS)
         parts.add(change.reshape(s.shape))

@@ -74,8 +74,8 @@ class ExactLane:
 
     def at_least(self, lower: float) -> bool:
         """Whether exact internal forces show ``t* >= lower``."""
-        if lower == -np.inf:
-            return True
+        if not np.isfinite(lower):
+            return lower == -np.inf
         forces = self.forces
         return forces is not None and any(margin_at_least(self.grasp, forces, lower, d) for d in DIGITS)
 

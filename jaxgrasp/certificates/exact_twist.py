@@ -13,6 +13,7 @@ from .dyadic import ExactGrasp, Twist, dot, twist_of
 from .elimination import null_vector, solve
 from .enclosures import root_above, root_below
 from .exact_force import Scaled
+from .rebuilt import EPS
 
 __all__ = ["escape_twist", "margin_at_most", "moves_all_alike", "rounding_distance", "without_pitch"]
 
@@ -144,16 +145,27 @@ def rounding_distance(grasp: ExactGrasp, lane: Scaled, xi: np.ndarray, friction:
     """How far, at most, the nearest numbers lie for which the twist escapes exactly; infinite where none are found.
 
     Positions over the length, angles of the normals, mu, gamma over the length; the largest of all. The twist is
-    first freed of its translation along its own axis, so that a contact can be moved to where it does not notice it.
+    first freed of its translation along its own axis, so that a contact can be moved to where it does not notice it;
+    the share of that translation counts as distance, too: another motion is no proof of this one.
     """
     exact = without_pitch(grasp, lane, xi)
     if not (any(exact.velocity) or any(exact.rotation)):
         return np.inf
-    worst = 0.0
+    worst = _pitch(grasp.dimension, xi)
     for i in grasp.contacts:
         if grasp.opposes(i, exact):
             worst = max(worst, _contact_distance(grasp, lane, exact, i, float(friction[i])))
     return worst
+
+
+def _pitch(dimension: int, xi: np.ndarray) -> float:
+    """The share of the twist's translation along its own axis, less what the rounding of its numbers makes of it."""
+    turn = xi[dimension:]
+    if dimension == 2 or not turn.any():
+        return 0.0
+    axis = turn / np.max(np.abs(turn))  # its square may underflow
+    along = abs(float(xi[:3] @ axis)) / float(np.linalg.norm(axis))
+    return max(along / float(np.linalg.norm(xi)) - 8 * EPS, 0.0)
 
 
 def without_pitch(grasp: ExactGrasp, lane: Scaled, xi: np.ndarray) -> Twist:
@@ -168,7 +180,8 @@ def without_pitch(grasp: ExactGrasp, lane: Scaled, xi: np.ndarray) -> Twist:
 
 def _root(value: Fraction) -> float:
     """The square root, rounded up."""
-    return float(root_above(value, 20)) * (1 + 1e-15)
+    root = root_above(value, 20)
+    return float(root) * (1 + 1e-15) if root < 2**1000 else np.inf
 
 
 def _contact_distance(grasp: ExactGrasp, lane: Scaled, twist: Twist, i: int, mu: float) -> float:

@@ -15,6 +15,7 @@ from .rebuilt import Rebuilt, component_vectors, rebuild, scaled_wrench
 __all__ = ["ForceProblem", "force_problem"]
 
 SQUARED = ("SumOfSquares", "LeastNorm")
+KNOWN = ("Gentlest", "SmallestSum", "Robust", *SQUARED)
 
 
 class ForceProblem(NamedTuple):
@@ -99,6 +100,8 @@ def force_problem(grasp, problem) -> ForceProblem:
             "forces are checked against the problem they answer: give wrench=.. and criterion=.., and max_normal=.., "
             "torque_limits=.. where there were any"
         )
+    if type(problem.criterion).__name__ not in KNOWN:
+        raise ValueError(f"no cost of {problem.criterion!r} can be proved; criteria are {', '.join(KNOWN)}")
     batch, k, dimension = grasp.position.shape[:-2], grasp.position.shape[-2], grasp.position.shape[-1]
     wrench = np.asarray(problem.wrench, np.float64)
     if wrench.shape[-1:] != (3 if dimension == 2 else 6,):

@@ -35,6 +35,7 @@ INVALID, OPTIMAL, INFEASIBLE, STALLED = 5, 6, 7, 8
 FINE = 256.0  # rounding, in units of eps of the grasp's dtype, that forces and costs may show
 ENDS = 4096.0  # eps of float64: what both ends of a bracket may lack
 NEARBY = 64.0  # eps: how far numbers may lie of which a proof to rounding speaks
+BLURRED = 1e-9  # of the cost: what rounding of forces near the edge may do to it in float64
 CLOSE = {8: 1e-6, 4: 2e-3}  # relative gap that OPTIMAL may leave, by the bytes of a number
 
 
@@ -74,12 +75,9 @@ def prove_forces(grasp, answer, problem, tolerance: float | None = None) -> Proo
         asked, claim = posed.asked, _claim(posed, answer)
         dtype = np.dtype(grasp.position.dtype)
         eps, close = float(np.finfo(dtype).eps), CLOSE[dtype.itemsize] if tolerance is None else tolerance
-        smoothing = getattr(answer, "smoothing", 0.0)
-        if not isinstance(smoothing, int | float) or not 0 <= smoothing < np.inf:
-            raise Malformed("smoothing")
-        level, shown = _held(posed, claim, eps, close, smoothing)
+        level, shown = _held(posed, claim, eps, close, getattr(problem, "smoothing", 0.0))
         lost = asked.valid & (claim.status == INFEASIBLE) & (claim.lower == np.inf) & (claim.upper == np.inf)
-        lost &= (claim.s == 0).all((-1, -2))
+        lost &= (claim.s == 0).all((-1, -2)) & np.isfinite(claim.escape_rates).all(-1)
         out, off = prove_separation(
             asked, posed.wrench, claim.escape_twist, claim.escape_rates, NEARBY * eps, lost
         )
@@ -95,20 +93,27 @@ def prove_forces(grasp, answer, problem, tolerance: float | None = None) -> Proo
     return Proof(*(x.reshape(posed.shape) for x in (LEVELS[level], distance, lower, upper, moved)))
 
 
+def _in_units(value: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """``value / unit``; NaN where a finite number becomes an infinite one, which says something else."""
+    scaled = value / unit
+    return np.where(np.isinf(scaled) & np.isfinite(value), np.nan, scaled)
+
+
 def _claim(posed: ForceProblem, answer) -> Claim:
     asked, said = posed.asked, Fields(answer, posed.shape)
     k, n = asked.known.scale.shape[1:]
     m, q = asked.load.shape[-1], asked.torque.shape[-1]
     force = said.numbers("force", k * n).reshape(-1, k, n) / posed.unit[:, None, None]
-    force = np.where(asked.known.live[..., None], force, 0.0)
+    # What does not exist presses nothing; an answer that says otherwise is refused.
+    force = np.where(asked.known.live[..., None] | (force == 0) | ~asked.valid[:, None, None], force, np.nan)
     # A squared cost has multipliers in units of force, the others have none.
     back = np.where(posed.cost_unit == posed.unit, 1.0, posed.unit)[:, None]
     length = asked.known.length
     return Claim(
         said.numbers("status"),
         scaled_force(force, asked.known.scale, asked.known.normal_index),
-        said.numbers("upper") / posed.cost_unit,
-        said.numbers("lower") / posed.cost_unit,
+        _in_units(said.numbers("upper"), posed.cost_unit),
+        _in_units(said.numbers("lower"), posed.cost_unit),
         scaled_twist(said.numbers("load_twist", m), length, asked.dimension) / back,
         scaled_twist(said.numbers("escape_twist", m), length, asked.dimension),
         said.numbers("joint_rates", q) / back,
@@ -123,16 +128,20 @@ def _held(
     asked, fine = posed.asked, FINE * eps
     value, size = cost(asked, claim.s)
     size = np.maximum(size, np.abs(value))
-    blur = fine * (size + robust_sensitivity(asked, claim.s))
+    # Forces on the edge of a cone have no cost to speak of: what they may blur is bounded.
+    blur = fine * (size + np.minimum(robust_sensitivity(asked, claim.s), max(16.0, BLURRED / fine) * size))
     room = np.maximum(blur, ENDS * EPS * size)
     limits = 3 * claim.s.shape[1] + 2 * asked.torque.shape[-1]
     allowed = np.maximum(tolerance * size, 4 * (smoothing / posed.cost_unit) * limits) + 4 * room
-    ordered = asked.valid & (claim.lower <= claim.upper)
+    # Where squares overflow nothing is compared.
+    ordered = asked.valid & (claim.lower <= claim.upper) & np.isfinite(blur)
     said = np.abs(value - claim.upper) <= blur
 
     def fits(shown: Shown) -> np.ndarray:
         cheap = said & np.isfinite(shown.upper)
-        dear = claim.lower <= shown.lower + room
+        # A lower end alone must not gain by forces that are far too large.
+        near = np.abs(shown.lower) if asked.weight is None else np.abs(shown.lower) + asked.weight
+        dear = claim.lower <= shown.lower + np.minimum(room, max(fine, ENDS * EPS) * near)
         width = np.maximum(claim.upper, shown.upper) - np.minimum(claim.lower, shown.lower)
         optimal = (claim.status == OPTIMAL) & cheap & dear & (width <= allowed)
         stalled = (claim.status == STALLED) & (dear | (claim.lower == -np.inf))
@@ -184,7 +193,8 @@ def _admissible(asked: Asked, s: np.ndarray, fine: float) -> np.ndarray:
     rooms, edge = edges_of(asked, s), fine * total[:, None]
     reach = np.linalg.norm(asked.scaled_jacobian(), axis=(1, 2)) * total[:, None]
     return (
-        (np.linalg.norm(applied + asked.load, axis=-1) <= fine * size)
+        np.isfinite(total + size)
+        & (np.linalg.norm(applied + asked.load, axis=-1) <= fine * size)
         & (rooms.cone >= -edge).all(-1)
         & (rooms.cap >= -edge).all(-1)
         & (rooms.torque >= -fine * (reach + np.where(np.isfinite(asked.torque), asked.torque, 0.0))).all(-1)

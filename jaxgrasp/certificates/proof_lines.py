@@ -116,7 +116,9 @@ def _twist(lane: ExactLane, d: int) -> dict[str, Any]:
     """The escape twist, exact; or one freed of its translation along its own axis, which holds to rounding."""
     twist, found = lane.escape, {}
     if twist is None:
-        twist, found = lane.without_pitch, {"proof": "to rounding", "within": lane.distance.hex()}
+        twist = lane.without_pitch
+        if lane.distance:
+            found = {"proof": "to rounding", "within": lane.distance.hex()}
     e = lane.grasp.length_exponent
     size = max(abs(x) for x in (*twist.velocity, *twist.rotation)).bit_length()
     velocity = [_parts(x, e - size) for x in twist.velocity[:d]]

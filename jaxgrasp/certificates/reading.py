@@ -28,7 +28,7 @@ class Fields:
         return array.astype(np.float64).reshape(math.prod(self.batch), *own)
 
     def array(self, name: str) -> np.ndarray:
-        """The field as it is. Malformed where there is none, or it is no array."""
+        """The field as it stands; Malformed where it is no array."""
         try:
             return np.asarray(getattr(self.answer, name))
         except Exception as error:

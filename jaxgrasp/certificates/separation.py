@@ -35,6 +35,7 @@ def prove_separation(
     twist, rates = twist / largest, rates / largest
     shown = _separates(asked, twist, rates)
     level, distance = np.where(lanes & shown, 2, 0), np.zeros(len(lanes))
+    twist = twist / np.max(np.abs(twist), -1, keepdims=True)
     for lane in np.flatnonzero(lanes & ~shown & np.isfinite(twist).all(-1)):
         level[lane], distance[lane] = _in_integers(asked, wrench[lane], twist[lane], int(lane), nearby)
     return level, distance
