@@ -132,7 +132,10 @@ def null_basis(
 
     room = jnp.where(exists, 1.0, 0.0).astype(A.dtype) - jnp.sum(Q * Q, axis=-2)
     start = (jnp.zeros((*A.shape[:-2], n, n), A.dtype), room)
-    return lax.fori_loop(jnp.int32(0), jnp.int32(n), next_column, start)[0]
+    most = jnp.max(left, initial=0)
+    return lax.while_loop(
+        lambda c: c[0] < most, lambda c: (c[0] + 1, next_column(c[0], c[1])), (jnp.int32(0), start)
+    )[1][0]
 
 
 @null_basis.defjvp
