@@ -25,7 +25,7 @@ from .criteria import Asked, Multipliers, cost, cost_change, lower_bound, robust
 from .force_problem import ForceProblem, force_problem
 from .interior import edges_of, exact_forces
 from .proof import LEVELS, Proof
-from .reading import Fields, Malformed
+from .reading import Fields
 from .rebuilt import EPS, scaled_force, scaled_twist
 from .separation import prove_separation
 

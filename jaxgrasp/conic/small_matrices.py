@@ -107,32 +107,17 @@ def null_basis(
 ) -> Float[Array, "*batch n n"]:
     """Orthonormal V with ``A V = 0`` among the components that exist; zero columns beyond the last.
 
-    A is zero where nothing exists. Its singular values above ``cut * max(1, largest)`` count. The largest remainder of
-    a unit vector, orthogonal to A's rows and to the columns found before, is the next column.
+    A is zero where nothing exists. Its singular values above ``cut * max(1, largest)`` count; the basis are the left
+    singular vectors of A^T that belong to the others.
     """
     n = A.shape[-1]
-    values, U = left_svd(A)
-    kept = values > cut * jnp.maximum(values[..., :1], 1.0)
-    Q = (
-        jnp.einsum("...mi,...mn->...in", U, A)
-        * jnp.where(kept, 1 / jnp.where(kept, values, 1.0), 0.0)[..., None]
-    )
-    left = jnp.sum(exists, axis=-1, dtype=jnp.int32) - jnp.sum(kept, axis=-1, dtype=jnp.int32)
-
-    def next_column(i: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        V, room = state
-        v = jax.nn.one_hot(jnp.argmax(room, axis=-1), n, dtype=A.dtype)
-        for _ in range(3):  # once, and twice again: orthogonal to rounding (Kahan, Parlett)
-            v = v - jnp.einsum("...in,...ij,...j->...n", Q, Q, v)
-            v = jnp.where(exists, v - jnp.einsum("...ni,...ji,...j->...n", V, V, v), 0.0)
-            size = jnp.sqrt(jnp.sum(v * v, axis=-1, keepdims=True))
-            v = jnp.where(size > 0, v / jnp.where(size > 0, size, 1.0), 0.0)
-        v = jnp.where(i < left[..., None], v, 0.0)
-        return jnp.where(jnp.arange(n, dtype=jnp.int32) == i, v[..., None], V), room - v * v
-
-    room = jnp.where(exists, 1.0, 0.0).astype(A.dtype) - jnp.sum(Q * Q, axis=-2)
-    start = (jnp.zeros((*A.shape[:-2], n, n), A.dtype), room)
-    return lax.fori_loop(jnp.int32(0), jnp.int32(n), next_column, start)[0]
+    values, U = left_svd(jnp.swapaxes(A, -1, -2))
+    # No rotation touches a row of zeros: what does not exist has a unit vector of its own.
+    absent = jnp.sum(jnp.where(exists[..., None], 0.0, jnp.abs(U)), axis=-2) > 0.5
+    inside = (values <= cut * jnp.maximum(values[..., :1], 1.0)) & ~absent
+    order = jnp.argsort(~inside, axis=-1, stable=True)
+    V = jnp.take_along_axis(U, order[..., None, :], axis=-1)
+    return jnp.where(jnp.arange(n) < jnp.sum(inside, axis=-1, keepdims=True)[..., None, :], V, 0.0)
 
 
 @null_basis.defjvp

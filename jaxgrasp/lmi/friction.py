@@ -11,7 +11,6 @@ from collections.abc import Iterator
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..conic import eigenvalues
 from ..contacts import Grasp, cleared, is_grasp, null_space
 from ..core import Array, Bool, Float, nan_where, rank_tolerance
 from .primal_dual import lmi_minimize
@@ -125,7 +124,8 @@ def _margin_problem(grasp: Grasp) -> tuple[LMIProblem, Bool[Array, "*batch"]]:
     constant = lmi.P(first)
     matrices = jnp.concatenate([lmi.reduced(V[..., 1:]), -counts[..., None, :, :]], axis=-3)
     cost = jnp.zeros(matrices.shape[:-2], dtype).at[..., -1].set(-1.0)
-    start = jnp.zeros_like(cost).at[..., -1].set(eigenvalues(constant)[..., -1] - 1.0)
+    least = -jnp.max(jnp.sum(jnp.abs(constant), axis=-1), axis=-1)  # at most the smallest eigenvalue
+    start = jnp.zeros_like(cost).at[..., -1].set(least - 1.0)
     return LMIProblem(cost, constant, matrices, start), squeezes
 
 
