@@ -144,7 +144,7 @@ def _primal_evidence(tile: Tile, rank: Rank, full_rank: Array, u: Cone) -> Prima
     residual, size = _norms(folded.columns, s)
     svd = rank.smallest - rounding * folded.norm / 2
     room = jnp.where(projection.sigma > 0, projection.sigma - rounding * folded.norm, svd)
-    known = room > 0
+    known = (room > 0) & (full_rank | unnoticed(rank))
     safe = jnp.where(known, room, one)
     shift = jnp.sqrt(2 * one) * (residual + rounding * folded.norm * size) / safe
     # The exact internal force lies within half of this of s; its mean normal force is 1 to within ``drift``.
