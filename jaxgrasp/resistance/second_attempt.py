@@ -354,8 +354,10 @@ def second_attempt(
 
     eps = unit_roundoff(length.dtype)
     m = A.hi.shape[0]
-    lower = jnp.where(sound, slack - error - 4 * eps * jnp.abs(slack), -jnp.inf)
-    upper = upper + 4 * eps * jnp.maximum(jnp.abs(upper), 1)
+    # Room for a checker that projects with other rounded lengths, in float64 at best.
+    room = 256 * unit_roundoff("float64")
+    lower = jnp.where(sound, slack - error - (room + 4 * eps) * jnp.abs(slack) - room, -jnp.inf)
+    upper = upper + room + (room + 4 * eps) * jnp.abs(upper)
     lower = jnp.minimum(lower, upper)
     full = first.rank >= m
     status = first_of(
