@@ -78,7 +78,9 @@ def measure(model, width: int, kind: str, count: int, chunk: int) -> Counter:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--markdown", type=Path)

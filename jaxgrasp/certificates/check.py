@@ -70,7 +70,11 @@ def prove(
     for forces without wrench and criterion, and for a problem of another shape.
     """
     problem = SimpleNamespace(
-        wrench=wrench, criterion=criterion, max_normal=max_normal, torque_limits=torque_limits, smoothing=smoothing
+        wrench=wrench,
+        criterion=criterion,
+        max_normal=max_normal,
+        torque_limits=torque_limits,
+        smoothing=smoothing,
     )
     prover = _prover(answer)
     try:
