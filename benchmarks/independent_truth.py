@@ -11,19 +11,21 @@ A contradiction is a proved verdict of the other sign, or a proved end of a brac
 from __future__ import annotations
 
 import argparse
+import importlib
 import sys
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 from adversarial import MODELS, draw  # it sets the paths and the precision
-from exact_margin import ExactMap
 from figures import write_figures
 
 import jaxgrasp as jg
 from jaxgrasp import Status
 
+ExactMap: Any = importlib.import_module("exact_margin").ExactMap
 WIDTHS = (2, 4, 8)
 KINDS = ("near critical", "near critical", "box", "tilted")
 COLUMNS = (
@@ -32,7 +34,7 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def contradicts(grasp: ExactMap, answer, force) -> tuple[bool, bool]:
+def contradicts(grasp: Any, answer, force) -> tuple[bool, bool]:
     """Whether 70 digits settle the lane, and whether they contradict what it says."""
     low, high = grasp.lower(force), grasp.upper(answer.bound_twist)
     status, wrong = int(answer.status), False
@@ -51,7 +53,7 @@ def measure(model, width: int, kind: str, count: int, chunk: int) -> Counter:
     answer = jg.wrench_resistance(grasp)
     proof, out = jg.prove(grasp, answer), Counter(lanes=count)
     names = [c.value for c in grasp.model.components(grasp.dimension)]
-    answer = jax.tree.map(np.asarray, answer)
+    answer: Any = jax.tree.map(np.asarray, answer)
     mu, gamma = np.asarray(grasp.model.friction_coefficient), np.asarray(grasp.model.torsion_coefficient)
     for i in range(count):
         how = Status(int(proof.status[i]))

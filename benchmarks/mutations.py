@@ -11,12 +11,14 @@ false is counted as still true or undecided.
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "tables"))
@@ -27,29 +29,32 @@ from figures import write_figures
 
 jax.config.update("jax_enable_x64", True)
 
-from damaged_answers import Kind, attack, attack_problem, attack_shapes  # noqa: E402
-from force_problems import CRITERIA, problems  # noqa: E402
-from mutated_kinds import epsilon_kind, force_kind, random_grasps, resistance_kind  # noqa: E402
-
+damaged: Any = importlib.import_module("damaged_answers")
+kinds_of: Any = importlib.import_module("mutated_kinds")
+tables: Any = importlib.import_module("force_problems")
+CRITERIA, problems, random_grasps = tables.CRITERIA, tables.problems, kinds_of.random_grasps
 COLUMNS = ("tried", "false", "refused of the false", "still true or undecided", "of these refused")
 
 
-def kinds(seed: int, lanes: int) -> Iterator[tuple[str, Kind]]:
+def kinds(seed: int, lanes: int) -> Iterator[tuple[str, Any]]:
     """Names of the rows, and the answers to be damaged."""
     rng = np.random.default_rng(seed)
     for model, k in (("soft", 5), ("hard", 3), ("planar", 4), ("frictionless", 8)):
-        yield "WrenchResistance", resistance_kind(model, random_grasps(rng, lanes, model, k))
+        yield "WrenchResistance", kinds_of.resistance_kind(model, random_grasps(rng, lanes, model, k))
     for criterion, (_, parameter) in CRITERIA.items():
         for limited in (False, True):
             grasp, _, wrench, cap, limit = problems(
                 "soft" if limited else "planar hard", limited, lanes, seed
             )
             name = criterion + (", limits" if limited else "")
-            yield f"OptimalForces, {name}", force_kind(name, grasp, wrench, criterion, parameter, cap, limit)
+            yield (
+                f"OptimalForces, {name}",
+                kinds_of.force_kind(name, grasp, wrench, criterion, parameter, cap, limit),
+            )
     for norm in ("L1", "Linf"):
         yield (
             f"EpsilonQuality, {norm}",
-            epsilon_kind("planar", random_grasps(rng, min(lanes, 40), "planar", 4), norm),
+            kinds_of.epsilon_kind("planar", random_grasps(rng, min(lanes, 40), "planar", 4), norm),
         )
 
 
@@ -80,9 +85,11 @@ def main() -> None:
             for field in (*kind.fields, *(("problem",) if kind.others else ())):
                 if done[row, field] >= options.false:
                     continue
-                counts, found = attack_problem(kind) if field == "problem" else attack(kind, field, rng)
+                counts, found = (
+                    damaged.attack_problem(kind) if field == "problem" else damaged.attack(kind, field, rng)
+                )
                 if not seed and field != "problem":
-                    counts["malformed"], more = attack_shapes(kind, field)
+                    counts["malformed"], more = damaged.attack_shapes(kind, field)
                     found += more
                 for name, count in counts.items():
                     rows.setdefault((row, field, name), Counter()).update(count)
