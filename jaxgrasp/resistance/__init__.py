@@ -2,13 +2,11 @@
 
 from .derivatives import Scales, Solved, differentiable
 from .problem import margin_program, starting_point, upper_bound
-from .rank import Rank
 from .solve import TOTAL_BUDGET, WrenchResistance, wrench_resistance
 from .trace import Trace, trace
 from .verdict import Verdict, judge
 
 __all__ = [
-    "Rank",
     "Scales",
     "Solved",
     "TOTAL_BUDGET",

@@ -50,9 +50,6 @@ def test_bodies_resting_on_others_are_not_resistant():
             assert float(out.lower[i]) * (1 + 1e-6) <= margin <= float(out.upper[i]) * (1 - 1e-6)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="brackets of -1e13, where parallel normals leave no squeeze, are refused"
-)
 def test_what_is_said_of_resting_bodies_is_proved():
     """Bodies on parallel normals have t* = -infinity but for rounding: no finite bracket below -1e12 is a number."""
     _, grasp = stacks()
