@@ -74,13 +74,13 @@ def kill_and_compare(command, kills, folder, longest=3.0, seed=0):
     assert left == {"whole.parquet", "out.parquet"}
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_one_writer_a_file_and_leftovers_go")
 @pytest.mark.parametrize("command", COMMANDS)
 def test_killed_runs_end_like_others_and_leave_nothing(command, tmp_path):
     kill_and_compare(command, 3, tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.slow("test_a_lock_whose_holder_was_killed_is_free")
 def test_the_second_of_two_runs_is_told_of_the_first(tmp_path):
     first = started(tmp_path, *COMMANDS["screen"], "--samples", "100000", "-o", "a.parquet", "--resume")
     lock = tmp_path / ".a.parquet.lock"

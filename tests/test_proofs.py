@@ -343,7 +343,7 @@ def test_the_checker_of_lines_is_short_and_alone():
     text = TOOL.read_text()
     assert len(text.splitlines()) <= 250
     imported = {line.split()[1] for line in text.splitlines() if line.startswith(("import ", "from "))}
-    assert imported == {"json", "math", "re", "sys", "fractions"}
+    assert imported == {"json", "math", "os", "re", "sys", "fractions"}
 
 
 # Parts -------------------------------------------------------------------------------------------------------
