@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ..backend import to_lanes
+from ..backend import fori_loop, to_lanes, while_loop
 from ..conic import Pair, pair, pair_roundoff, pair_sqrt, pair_sum, pair_where
 from ..contacts import Component, Contacts, normal_first
 from ..core import Array, Status, first_of, frame_components, unit_roundoff
@@ -141,7 +141,7 @@ def _orthonormal(A: Pair) -> tuple[Pair, Pair]:
         rows = rows - overlap[:, None] * row[None]
         return jax.tree.map(lambda x, r: lax.dynamic_update_index_in_dim(x, r, j, 0), rows, row)
 
-    wide = lax.fori_loop(0, 2 * m, one, wide)
+    wide = fori_loop(0, 2 * m, one, wide)
     Q = jax.tree.map(lambda x: x[:, : d * k].reshape(m, d, k, lanes), wide)
     return Q, wide[:, d * k :]
 
@@ -182,7 +182,7 @@ def _solved(H: Pair, rhs: Pair) -> Pair:
         rows = rows - pair_where(others, column, pair(jnp.zeros_like(column.hi))) * row[None]
         return jax.tree.map(lambda x, r: lax.dynamic_update_index_in_dim(x, r, j, 0), rows, row)
 
-    return lax.fori_loop(0, m, one, wide)[:, m:]
+    return fori_loop(0, m, one, wide)[:, m:]
 
 
 class _State(NamedTuple):
@@ -277,7 +277,7 @@ def _path(problem: _Problem, goal: Array) -> tuple[Pair, Pair]:
     def unfinished(carry: tuple[Array, _State]) -> Array:
         return (carry[0] < BUDGET) & jnp.any(carry[1].running)
 
-    end = lax.while_loop(unfinished, body, (jnp.int32(0), start))[1]
+    end = while_loop(unfinished, body, (jnp.int32(0), start), (problem, goal))[1]
     t = 1.0 + -pair_sum(end.u[0], 0) / count
     s = jax.tree.map(lambda x, h: jnp.concatenate([h[None], x[1:]]), end.u, exists * t + end.u[0])
     return s, pair_sum(problem.T * (-end.best)[:, None], 0)
