@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from .dyadic import ForceSet, Twist, exact_grasp
+from .dyadic import ForceSet, Twist, exact_grasp, twist_of
 from .elimination import independent
 from .enclosures import DIGITS
 from .exact_force import internal_force, margin_at_least, scaled_lane
@@ -21,12 +21,13 @@ class ExactLane:
 
     s (k, n)            an internal force near which an exact one is sought, scaled, |s| = 1
     escape, bound (m,)  twists, lengths over L
+    given               both twists as they stand, in body units: a rounded copy shows less where A is ill-conditioned
     nearby              how far numbers may lie of which a proof to rounding speaks
     """
 
     def __init__(
         self, known: Rebuilt, lane: int, dimension: int, s: np.ndarray, escape: np.ndarray, bound: np.ndarray,
-        nearby: float,
+        given: tuple[np.ndarray, np.ndarray], nearby: float,
     ):  # fmt: skip
         live = known.live[lane]
         self.friction = known.friction[lane][live]
@@ -34,7 +35,7 @@ class ExactLane:
             known.position[lane][live], known.normal[lane][live], self.friction, known.torsion[lane][live]
         )
         self.scaled, self.s = scaled_lane(known, lane, dimension), s[live]
-        self.twist, self.bound, self.nearby = escape, bound, nearby
+        self.twist, self.bound, self.given, self.nearby = escape, bound, given, nearby
 
     @cached_property
     def _balanced(self) -> tuple[ForceSet, int] | None:
@@ -58,7 +59,12 @@ class ExactLane:
     @cached_property
     def escape(self) -> Twist | None:
         """A twist that no contact can oppose, exactly."""
-        return escape_twist(self.grasp, self.scaled, self.twist) if np.isfinite(self.twist).all() else None
+        if not (np.isfinite(self.twist).all() and np.isfinite(self.given[0]).all()):
+            return None
+        direct = twist_of(self.grasp, self.given[0])
+        if self.grasp.escapes(direct):
+            return direct
+        return escape_twist(self.grasp, self.scaled, self.twist)
 
     @cached_property
     def distance(self) -> float:
@@ -83,9 +89,9 @@ class ExactLane:
         """Whether the bound twist, or for -inf the contacts alone, show ``t* <= upper``."""
         if upper == -np.inf:
             return independent(self.grasp.unit_wrenches()[0]) or moves_all_alike(self.grasp)
-        known = np.isfinite(self.bound).all()
+        known = np.isfinite(self.given[1]).all()
         return bool(known) and any(
-            margin_at_most(self.grasp, self.scaled, self.bound, upper, d) for d in DIGITS
+            margin_at_most(self.grasp, twist_of(self.grasp, self.given[1]), upper, d) for d in DIGITS
         )
 
     def at_least_nearby(self, lower: float) -> float:

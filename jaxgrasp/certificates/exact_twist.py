@@ -92,14 +92,13 @@ def _inwards(lane: Scaled, x: np.ndarray, unseen: np.ndarray, size: float) -> np
     return np.linalg.lstsq(np.array(rows), np.array(right), rcond=1e-12)[0]
 
 
-def margin_at_most(grasp: ExactGrasp, lane: Scaled, xi: np.ndarray, claim: float, digits: int) -> bool:
+def margin_at_most(grasp: ExactGrasp, twist: Twist, claim: float, digits: int) -> bool:
     """Whether the largest multiple of -xi that the dual admits shows ``t* <= claim``.
 
     With x_i the contact's velocity, T = sum_i x_n,i: ``claim T + (1 - claim) k (x_n,i - |x_t,i|) >= 0`` for all i.
     """
     if claim >= 1:
         return True
-    twist = twist_of(grasp, _physical(lane, grasp.dimension, xi))
     if not (any(twist.velocity) or any(twist.rotation)):
         return False
     heads, tails = [], []

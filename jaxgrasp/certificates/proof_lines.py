@@ -62,7 +62,16 @@ def proof_lines(grasp, answer, proof: Proof) -> list[dict[str, Any] | None]:
         if status not in CLAIMS or int(how) not in HOW:
             out.append(None)
             continue
-        lane = ExactLane(known, i, dimension, sized.s[i], sized.escape[i], sized.bound[i], nearby)
+        lane = ExactLane(
+            known,
+            i,
+            dimension,
+            sized.s[i],
+            sized.escape[i],
+            sized.bound[i],
+            (claim.escape[i], claim.bound[i]),
+            nearby,
+        )
         ends = float(claim.lower[i]), float(claim.upper[i])
         try:
             out.append(_line(lane, CLAIMS[status], ends) | _numbers(known, i))
@@ -86,8 +95,7 @@ def _line(lane: ExactLane, claim: str, ends: tuple[float, float]) -> dict[str, A
     lower, upper = ends
     margin: list[str | None] = [None, None]
     if np.isfinite(upper) and lane.at_most(upper):
-        bound = np.concatenate([lane.bound[:d] * lane.scaled.length, lane.bound[d:]])
-        margin[1], line["bound_twist"] = upper.hex(), _hex(bound)
+        margin[1], line["bound_twist"] = upper.hex(), _hex(lane.given[1])
     pressing = np.isfinite(lower) and lane.at_least(lower)
     if pressing:
         margin[0] = lower.hex()

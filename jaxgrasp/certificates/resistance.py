@@ -127,7 +127,7 @@ def _proved(
     known: Rebuilt, claim: Claim, dimension: int, eps: float, tolerance: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Levels 0, 1, 2 and distances (N,)."""
-    claim = of_size_one(known, claim, dimension)
+    raw, claim = claim, of_size_one(known, claim, dimension)
     facts = _facts(known, claim)
     fits = numeric_rank_fits(known.A, claim.rank, facts.sigma, eps)
     marginal = _marginal(claim, tolerance, eps)
@@ -142,7 +142,16 @@ def _proved(
     done = verdict & facts.at_least & facts.at_most
     level, distance = np.where(sound & done, 2, 0), np.zeros(len(sound))
     for i in np.flatnonzero(sound & ~done):
-        lane = ExactLane(known, int(i), dimension, claim.s[i], claim.escape[i], claim.bound[i], NEARBY * eps)
+        lane = ExactLane(
+            known,
+            int(i),
+            dimension,
+            claim.s[i],
+            claim.escape[i],
+            claim.bound[i],
+            (raw.escape[i], raw.bound[i]),
+            NEARBY * eps,
+        )
         proved = bool(verdict[i]), bool(facts.at_least[i]), bool(facts.at_most[i])
         ends = float(claim.lower[i]), float(claim.upper[i])
         level[i], distance[i] = _exactly(lane, int(claim.status[i]), ends, not full[i], proved)
