@@ -178,6 +178,16 @@ def test_pseudo_inverse_at_a_lower_rank(dtype):
     np.testing.assert_allclose(found, np.linalg.pinv(A, rcond=1e-5), atol=20 * close(dtype)["atol"])
 
 
+def test_pseudo_inverse_of_an_ill_conditioned_matrix(dtype):
+    """What is balanced is balanced to eps cond, not to eps cond^2."""
+    eps = np.finfo(dtype).eps
+    A = np.linalg.qr(matrices(6, 6, "float64"))[0] * eps ** (np.arange(6) / 10)
+    A = (A @ np.linalg.qr(matrices(6, 12, "float64").swapaxes(-1, -2))[0].swapaxes(-1, -2)).astype(dtype)
+    P = np.asarray(pseudo_inverse(jnp.asarray(A), 64 * eps))
+    assert np.linalg.cond(A).max() > 0.5 * eps**-0.5
+    assert np.abs(A @ P - np.eye(6)).max() < 30 * eps**0.5
+
+
 def test_solve_exchanges_rows(dtype):
     M, b = matrices(5, 5, dtype), matrices(5, 2, dtype)
     M[..., 0, 0] = 0.0

@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from ..conic import pseudo_inverse
 from ..contacts import Grasp, TorqueLimits, cleared, grasp_map, is_grasp, length_scale, null_space
 from ..core import (
     Answer,
@@ -213,7 +212,9 @@ def _reduce(grasp: Grasp, limit, torques, wrench: Array) -> _Reduced:
     scaling = jnp.where(grasp.active[:, None], cleared(grasp).model.scaling(grasp.dimension), 0.0)
     exists = scaling.reshape(-1) != 0  # components with coefficient 0 stay exactly 0
     G = jnp.where(exists, grasp_map(grasp), 0.0) * per_length[:, None]
-    particular = -pseudo_inverse(G, rank_tolerance(grasp.dtype)) @ (load / size)
+    left, values, right = jnp.linalg.svd(G, full_matrices=False)
+    kept = values > rank_tolerance(grasp.dtype) * jnp.maximum(values[0], 1.0)
+    particular = -right.T @ jnp.where(kept, left.T @ (load / size) / jnp.where(kept, values, 1.0), 0.0)
     particular = jnp.where(exists, particular, 0.0)
     V, cones = jnp.where(exists[:, None], null_space(grasp), 0.0), friction_lmi(grasp)
     return _Reduced(
