@@ -52,6 +52,7 @@ def cases(count: int) -> dict:
         "grasp_rank": lambda: jg.grasp_rank(grasp),
         "null_space": lambda: jg.null_space(grasp),
         "squeeze": lambda: jg.squeeze(grasp, load),
+        "lmi_margin, 64 grasps": lambda: jg.lmi.lmi_margin(grasp[:64]),
         "epsilon_quality, 256 grasps": lambda: jg.epsilon_quality(grasp[:256]),
     }
 

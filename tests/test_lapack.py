@@ -1,6 +1,7 @@
-"""No two LAPACK calls at once: two batched ones can wait for each other's workers for ever on a machine of few cores.
+"""No LAPACK call on many matrices at once: two of them can wait for each other's workers for ever on few cores, be they
+in one program or in two threads. A call on one matrix asks for no workers.
 
-Outside of ``lmi`` nothing calls LAPACK on JAX arrays; there one call waits for the other, and none is one of a batch.
+Outside of ``lmi`` nothing calls LAPACK on JAX arrays; there, problems run one after another, a matrix a call.
 """
 
 import ast
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from grasps import ball
-from lapack import at_once, lapack_calls
+from lapack import lapack_calls
 from motion import random_bodies, random_states
 
 import jaxgrasp as jg
@@ -25,20 +26,15 @@ from jaxgrasp.quality import grasp_isotropy, grasp_volume
 PACKAGE = Path(jg.__file__).parent
 
 
-def test_the_finder_finds_what_runs_at_once():
+def test_the_finder_finds_calls_wherever_they_are():
     x = np.eye(3)
     factor, svd = jnp.linalg.cholesky, functools.partial(jnp.linalg.svd, compute_uv=False)
-    assert at_once(lambda x: (factor(x), factor(2 * x)), x) == [("cholesky", "cholesky")]
-    assert at_once(lambda x: factor(factor(x)), x) == []
-    assert at_once(lambda x: (jax.jit(factor)(x), jax.vmap(svd)(x[None])), x) == [("cholesky", "svd")]
-    # A function in a function is written out: one of its results does not wait for the other.
-    two = jax.jit(lambda x: (factor(x), x + 1))
-    assert at_once(lambda x: factor(two(x)[1]), x) == [("cholesky", "cholesky")]
-    assert at_once(lambda x: factor(two(x)[0]), x) == []
+    assert lapack_calls(lambda x: (factor(x), jax.jit(svd)(x)), x) == [("cholesky", 1), ("svd", 1)]
+    assert lapack_calls(jax.vmap(jax.vmap(factor)), np.ones((2, 5, 3, 3))) == [("cholesky", 10)]
     loop = functools.partial(jax.lax.fori_loop, 0, 3, lambda _, x: factor(x) + factor(x.T))
-    assert at_once(loop, x) == [("cholesky", "cholesky")]
-    (pair,) = at_once(lambda x: (loop(x), factor(x))[0] + factor(x), x)[1:2]
-    assert pair[1] == "cholesky"
+    assert lapack_calls(loop, x) == [("cholesky", 1)] * 2
+    assert lapack_calls(jax.vmap(loop), x[None].repeat(4, 0)) == [("cholesky", 4)] * 2
+    assert lapack_calls(jax.grad(lambda x: jnp.sum(svd(x))), x)[0] == ("svd", 1)
 
 
 def test_no_room_but_lmi_names_a_lapack_routine():
@@ -115,10 +111,10 @@ FREE = {
 
 @pytest.mark.parametrize("name", FREE)
 def test_programs_without_lapack(name):
-    assert lapack_calls(FREE[name], grasps()) == 0
+    assert lapack_calls(FREE[name], grasps()) == []
 
 
-ORDERED = {
+SINGLE = {
     "lmi_margin": lmi_margin,
     "gentlest by LMI": lambda g: lmi_forces(g, LOAD, criterion=jg.Gentlest()),
     "robust by LMI": lambda g: lmi_forces(g, LOAD, criterion=jg.Robust(0.1)),
@@ -126,12 +122,12 @@ ORDERED = {
 }
 
 
-@pytest.mark.parametrize("name", ORDERED)
+@pytest.mark.parametrize("name", SINGLE)
 @pytest.mark.parametrize("batch", [True, False])
-def test_programs_with_one_lapack_call_after_another(name, batch):
-    given = grasps() if batch else grasps()[0]
-    assert lapack_calls(ORDERED[name], given) > 5
-    assert at_once(ORDERED[name], given) == []
+def test_programs_with_one_matrix_a_call(name, batch):
+    found = lapack_calls(SINGLE[name], grasps() if batch else grasps()[0])
+    assert len(found) > 5
+    assert {matrices for _, matrices in found} == {1}
 
 
 # What stands for LAPACK --------------------------------------------------------------------------------
