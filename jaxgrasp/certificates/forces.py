@@ -160,7 +160,7 @@ def _shown(asked: Asked, claim: Claim, eps: float) -> tuple[Shown, Shown]:
     """What is proved of the problem itself, and of one within rounding."""
     given = _admissible(asked, claim.s, FINE * eps)
     exact = exact_forces(asked, claim.s, FINE * eps)
-    near, distance = _pulled_in(asked, claim.s, exact.s)
+    near, distance = _pulled_in(asked, claim.s, exact.s, NEARBY * eps)
     nothing = np.zeros(len(near))
     return (
         _of_forces(asked, claim, exact.s, exact.shift, given & exact.shown, nothing),
@@ -201,26 +201,46 @@ def _admissible(asked: Asked, s: np.ndarray, fine: float) -> np.ndarray:
     )
 
 
-def _pulled_in(asked: Asked, given: np.ndarray, balanced: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Forces pulled onto their cones and caps, and how far the load lies that they balance, over its size.
+def _pulled_in(asked: Asked, given: np.ndarray, balanced: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray]:
+    """Forces inside all limits of a problem next to the one given, and how far its numbers lie, over their size.
 
-    Of the forces as given and of those balanced again, the nearer.
+    Friction, caps, torques and J may be better by ``near`` at most; what is still outside is pulled onto its cone or
+    cap, and balances another load. Of the forces as given and of those balanced again, the nearer.
     """
     best, least = given, np.full(len(given), np.inf)
+    live, lanes = asked.known.live, len(given)
     for s in (given, balanced):
         tail = np.linalg.norm(s[..., 1:], axis=-1)
-        head = np.clip(s[..., 0], 0.0, asked.cap)
-        shrink = np.minimum(1.0, head / np.where(tail > 0, tail, 1.0))
-        s = np.concatenate([head[..., None], s[..., 1:] * shrink[..., None]], -1)
-        total = np.linalg.norm(s.reshape(len(s), -1), axis=-1)
-        size = np.linalg.norm(asked.known.A, axis=(-2, -1)) * total + np.linalg.norm(asked.load, axis=-1)
-        applied = np.einsum("lij,lj->li", asked.known.A, s.reshape(len(s), -1)) + asked.load
-        off = np.linalg.norm(applied, axis=-1) / np.where(size > 0, size, 1.0)
-        over = np.maximum(-edges_of(asked, s).torque, 0.0) / np.where(asked.torque > 0, asked.torque, 1.0)
-        distance = np.maximum(off, np.max(over, -1, initial=0.0)) + 2 * EPS
-        better = distance < least
-        best, least = np.where(better[:, None, None], s, best), np.where(better, distance, least)
-    return best, least
+        for better in (0.0, near / 2, near * (1 - 1 / 64)):
+            head = np.clip(s[..., 0], 0.0, asked.cap * (1 + better))
+            reached = np.where(live & (tail > head), tail, 0.0)
+            shrink = np.where(reached > 0, np.minimum(1.0, head * (1 + better) / np.where(reached > 0, tail, 1.0)), 1.0)
+            inside = np.concatenate([head[..., None], s[..., 1:] * shrink[..., None]], -1)
+            distance = np.maximum(_missing_load(asked, inside), _missing_torque(asked, inside))
+            used = np.max(np.where(head > asked.cap, better, 0.0), -1, initial=0.0)
+            used = np.maximum(used, np.max(np.where(reached > 0, better, 0.0), -1, initial=0.0))
+            distance = np.maximum(distance, used) + 2 * EPS
+            closer = distance < least
+            best = np.where(closer[:, None, None], inside, best)
+            least = np.where(closer, distance, least)
+    return best.reshape(lanes, *given.shape[1:]), least
+
+
+def _missing_load(asked: Asked, s: np.ndarray) -> np.ndarray:
+    """What the forces leave of the load, over the size of its terms."""
+    flat = s.reshape(len(s), -1)
+    applied = np.einsum("lij,lj->li", asked.known.A, flat) + asked.load
+    size = np.linalg.norm(asked.known.A, axis=(-2, -1)) * np.linalg.norm(flat, axis=-1)
+    size = size + np.linalg.norm(asked.load, axis=-1)
+    return np.linalg.norm(applied, axis=-1) / np.where(size > 0, size, 1.0)
+
+
+def _missing_torque(asked: Asked, s: np.ndarray) -> np.ndarray:
+    """By what share tau_max and J would have to be better."""
+    over = np.maximum(-edges_of(asked, s).torque, 0.0)
+    size = np.einsum("lknj,lkn->lj", np.abs(asked.scaled_jacobian()), np.abs(s))
+    size = size + np.where(np.isfinite(asked.torque), asked.torque, 0.0)
+    return np.max(over / np.where(size > 0, size, 1.0), -1, initial=0.0)
 
 
 def _proved_bound(asked: Asked, claim: Claim, s: np.ndarray) -> np.ndarray:

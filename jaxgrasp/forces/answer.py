@@ -93,12 +93,21 @@ class Multipliers(NamedTuple):
 
 
 @stage
-def _polished(basis: Cone, rhs: Array, exists: Array, u: Cone) -> Cone:
-    """The nearest point with ``Q u = b``, twice, so that what is left is rounding."""
-    for _ in range(2):
+def _polished(program: ConvexConeProgram, basis: Cone, u: Cone) -> Cone:
+    """The nearest point with ``Q u = b``, until what is left is rounding; between, back inside the limits of torques."""
+    m, rounds = program.rhs.shape[0], 2 if program.bound is None else 3
+    for i in range(rounds):
         applied = matvec(basis, u)
-        back = rmatvec(basis, rhs - applied)
-        u = tuple(exists * (a + b) for a, b in zip(u, back, strict=True))
+        back = rmatvec(basis, program.rhs - applied)
+        u = tuple(program.exists * (a + b) for a, b in zip(u, back, strict=True))
+        if program.bound is None or i == rounds - 1:
+            continue
+        rows = tuple(c[m:] for c in program.columns)
+        product = matvec(rows, u)
+        square = sum(jnp.sum(c * c, axis=1) for c in rows)
+        over = jnp.maximum(jnp.abs(product) - program.bound, jnp.zeros_like(product)) * jnp.sign(product)
+        over = over / jnp.where(square > 0, square, jnp.ones_like(square))
+        u = tuple(a - b for a, b in zip(u, rmatvec(rows, over), strict=True))
     return u
 
 
@@ -160,7 +169,7 @@ def answer(problem: ForceProblem, state: ConvexState, tolerance: Array) -> Answe
     """Read one tile's answers off its points. Nothing is claimed that was not proven."""
     program, load, projection = problem.program, problem.load, problem.tile.projection
     m, dtype = program.rhs.shape[0], problem.tile.folded.norm.dtype
-    u = _polished(projection.basis.columns, program.rhs, program.exists, state.point.u)
+    u = _polished(program, projection.basis.columns, state.point.u)
     rows, ray = _all_rows(state.point), _to_size_one(state.ray)
     linear = program.curvature is None and program.cone_floor is None
     if program.cap is not None and linear and program.smoothing is None:
