@@ -154,19 +154,20 @@ def check_escape(grasp, line):
     if line["proof"] == "to rounding":
         within = number(line.get("within"))
         require(0 < within <= Q(1, 2**17), "within is more than 64 eps of float32")
-    ww, length = dot(twist[1], twist[1]), max(dot(p, p) for p in grasp.p) or 1
-    for i, (h, slide, about, uu, nn) in enumerate(grasp.motions(twist)):
-        mu, gamma = grasp.mu[i], grasp.gamma[i]
+    ww, uw, length = dot(twist[1], twist[1]), dot(*twist), max(dot(p, p) for p in grasp.p) or 1
+    for i, (mu, gamma, (h, slide, about, uu, nn)) in enumerate(zip(grasp.mu, grasp.gamma, grasp.motions(twist))):
         if h >= 0 and h * h >= mu**2 * slide + (gamma * about) ** 2:
             continue
         # Which numbers nearby give way: p moves to where u = 0 and n turns across w; or mu and gamma shrink; or n turns
-        # and mu and gamma vanish. An angle a is at most 1.6 sin a.
+        # across u, and mu and gamma vanish; or n turns across u and w, and mu vanishes. An angle a is <= 1.6 sin a.
         frail = gamma**2 <= within**2 * length
         turned = frail or (about * Q(8, 5)) ** 2 <= within**2 * ww * nn
-        moved = ww > 0 and dot(*twist) == 0 and uu <= within**2 * length * ww and turned
+        moved = ww > 0 and uw == 0 and uu <= within**2 * length * ww and turned
         slides = h >= 0 and h * h >= max(mu - within, Q(0)) ** 2 * slide and frail
         smooth = (h * Q(8, 5)) ** 2 <= within**2 * uu * nn and mu <= within and frail
-        require(within and (moved or slides or smooth), f"contact {i} can oppose the twist")
+        area, off = uu * ww - uw**2, h * h * ww + about**2 * uu - 2 * h * about * uw
+        both = area > 0 and off * Q(64, 25) <= within**2 * nn * area and mu <= within
+        require(within and (moved or slides or smooth or both), f"contact {i} can oppose the twist")
 
 
 def enclosed(cones):

@@ -188,5 +188,5 @@ class _Lane:
         xi, scaled = -self.claim.direction[lane] * self.row_scale, scaled_lane(known, lane, self.dimension)
         if escape_twist(grasp, scaled, xi) is not None:
             return 2, 0.0
-        distance = rounding_distance(grasp, scaled, xi, known.friction[lane][live])
+        distance, _ = rounding_distance(grasp, scaled, xi, known.friction[lane][live])
         return (1, distance) if distance <= NEARBY * self.eps else (0, np.inf)

@@ -10,7 +10,7 @@ from .dyadic import ForceSet, Twist, exact_grasp, twist_of
 from .elimination import independent
 from .enclosures import DIGITS
 from .exact_force import internal_force, margin_at_least, scaled_lane
-from .exact_twist import escape_twist, margin_at_most, moves_all_alike, rounding_distance, without_pitch
+from .exact_twist import escape_twist, margin_at_most, moves_all_alike, rounding_distance
 from .rebuilt import EPS, Rebuilt
 
 __all__ = ["ExactLane"]
@@ -67,16 +67,15 @@ class ExactLane:
         return escape_twist(self.grasp, self.scaled, self.twist)
 
     @cached_property
-    def distance(self) -> float:
-        """How far the numbers lie, at most, for which the twist escapes."""
+    def nearest(self) -> tuple[float, Twist | None]:
+        """How far the numbers lie, at most, for which a twist next to the given one escapes, and that twist."""
         if not np.isfinite(self.twist).all():
-            return np.inf
+            return np.inf, None
         return rounding_distance(self.grasp, self.scaled, self.twist, self.friction)
 
     @property
-    def without_pitch(self) -> Twist:
-        """The twist that escapes from numbers within ``distance``."""
-        return without_pitch(self.grasp, self.scaled, self.twist)
+    def distance(self) -> float:
+        return self.nearest[0]
 
     def at_least(self, lower: float) -> bool:
         """Whether exact internal forces show ``t* >= lower``."""

@@ -140,21 +140,28 @@ def moves_all_alike(grasp: ExactGrasp) -> bool:
     return solve(rows, [int(x * scale) for x in right]) is not None
 
 
-def rounding_distance(grasp: ExactGrasp, lane: Scaled, xi: np.ndarray, friction: np.ndarray) -> float:
-    """How far, at most, the nearest numbers lie for which the twist escapes exactly; infinite where none are found.
+def rounding_distance(
+    grasp: ExactGrasp, lane: Scaled, xi: np.ndarray, friction: np.ndarray
+) -> tuple[float, Twist]:
+    """How far, at most, the numbers lie for which a twist escapes exactly, and that twist; infinite: none found.
 
-    Positions over the length, angles of the normals, mu, gamma over the length; the largest of all. The twist is
-    first freed of its translation along its own axis, so that a contact can be moved to where it does not notice it;
-    the share of that translation counts as distance, too: another motion is no proof of this one.
+    Positions over the length, angles of the normals, mu, gamma over the length; the largest of all. The twist is taken
+    as it stands, and freed of its translation along its own axis, so that a contact can be moved to where it does not
+    notice it; the share of that translation counts as distance, too: another motion is no proof of this one.
     """
-    exact = without_pitch(grasp, lane, xi)
-    if not (any(exact.velocity) or any(exact.rotation)):
-        return np.inf
-    worst = _pitch(grasp.dimension, xi)
-    for i in grasp.contacts:
-        if grasp.opposes(i, exact):
-            worst = max(worst, _contact_distance(grasp, lane, exact, i, float(friction[i])))
-    return worst
+    direct = twist_of(grasp, _physical(lane, grasp.dimension, xi))
+    turned = without_pitch(grasp, lane, xi)
+    if not (any(turned.velocity) or any(turned.rotation)):
+        return np.inf, turned
+    ways = (0.0, direct), (_pitch(grasp.dimension, xi), turned)
+    found = [(_farthest(grasp, lane, twist, friction, least), twist) for least, twist in ways]
+    return min(found, key=lambda x: x[0])
+
+
+def _farthest(grasp: ExactGrasp, lane: Scaled, twist: Twist, friction: np.ndarray, least: float) -> float:
+    """The distance of the contact that has to change most; at least ``least``."""
+    opposed = (i for i in grasp.contacts if grasp.opposes(i, twist))
+    return max([least, *(_contact_distance(grasp, lane, twist, i, float(friction[i])) for i in opposed)])
 
 
 def _pitch(dimension: int, xi: np.ndarray) -> float:
@@ -196,7 +203,7 @@ def _contact_distance(grasp: ExactGrasp, lane: Scaled, twist: Twist, i: int, mu:
     if grasp.torsion[i] and about:
         twisting = min(_root(Fraction(about * about, spin * nn)) * 1.6, gamma)
     ways = []
-    if spin:
+    if spin and not dot(twist.velocity, turn):  # the contact moves onto the axis
         ways.append(max(_root(Fraction(speed) / (spin * length * length)), twisting))
     if twisting == 0.0 or twisting == gamma:
         if speed and h < 0:  # the normal turns until the contact slides, without friction
@@ -206,4 +213,8 @@ def _contact_distance(grasp: ExactGrasp, lane: Scaled, twist: Twist, i: int, mu:
             if sliding > 0:
                 limit = float(root_below(Fraction(h * h, nn) / sliding, 20)) if h else 0.0
                 ways.append(max(mu - limit * (1 - 1e-15), gamma))
+    area = speed * spin - dot(u, turn) ** 2
+    if area and twisting > 0.0:  # the normal turns until the contact slides and does not twist: torsion stays
+        off = h * h * spin + about * about * speed - 2 * h * about * dot(u, turn)
+        ways.append(max(_root(Fraction(off, nn * area)) * 1.6, mu))
     return min(ways, default=np.inf)

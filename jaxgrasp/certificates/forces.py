@@ -201,7 +201,9 @@ def _admissible(asked: Asked, s: np.ndarray, fine: float) -> np.ndarray:
     )
 
 
-def _pulled_in(asked: Asked, given: np.ndarray, balanced: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray]:
+def _pulled_in(
+    asked: Asked, given: np.ndarray, balanced: np.ndarray, near: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Forces inside all limits of a problem next to the one given, and how far its numbers lie, over their size.
 
     Friction, caps, torques and J may be better by ``near`` at most; what is still outside is pulled onto its cone or
@@ -214,7 +216,9 @@ def _pulled_in(asked: Asked, given: np.ndarray, balanced: np.ndarray, near: floa
         for better in (0.0, near / 2, near * (1 - 1 / 64)):
             head = np.clip(s[..., 0], 0.0, asked.cap * (1 + better))
             reached = np.where(live & (tail > head), tail, 0.0)
-            shrink = np.where(reached > 0, np.minimum(1.0, head * (1 + better) / np.where(reached > 0, tail, 1.0)), 1.0)
+            shrink = np.where(
+                reached > 0, np.minimum(1.0, head * (1 + better) / np.where(reached > 0, tail, 1.0)), 1.0
+            )
             inside = np.concatenate([head[..., None], s[..., 1:] * shrink[..., None]], -1)
             distance = np.maximum(_missing_load(asked, inside), _missing_torque(asked, inside))
             used = np.max(np.where(head > asked.cap, better, 0.0), -1, initial=0.0)

@@ -124,7 +124,7 @@ def _twist(lane: ExactLane, d: int) -> dict[str, Any]:
     """The escape twist, exact; or one freed of its translation along its own axis, which holds to rounding."""
     twist, found = lane.escape, {}
     if twist is None:
-        twist = lane.without_pitch
+        _, twist = lane.nearest
         if lane.distance:
             found = {"proof": "to rounding", "within": lane.distance.hex()}
     e = lane.grasp.length_exponent

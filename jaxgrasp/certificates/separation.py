@@ -75,7 +75,7 @@ def _in_integers(
     clear = float(twist @ asked.load[lane]) > 64 * nearby * float(
         np.linalg.norm(twist) * np.linalg.norm(asked.load[lane])
     )
-    distance = rounding_distance(grasp, scaled, twist, known.friction[lane][live])
+    distance, _ = rounding_distance(grasp, scaled, twist, known.friction[lane][live])
     return (1, distance) if clear and distance <= nearby else (0, np.inf)
 
 

@@ -94,7 +94,7 @@ class Multipliers(NamedTuple):
 
 @stage
 def _polished(program: ConvexConeProgram, basis: Cone, u: Cone) -> Cone:
-    """The nearest point with ``Q u = b``, until what is left is rounding; between, back inside the limits of torques."""
+    """The nearest point with ``Q u = b``, to rounding; between, back inside the limits of torques."""
     m, rounds = program.rhs.shape[0], 2 if program.bound is None else 3
     for i in range(rounds):
         applied = matvec(basis, u)
