@@ -1,7 +1,8 @@
-"""No LAPACK call on many matrices at once: two of them can wait for each other's workers for ever on few cores, be they
-in one program or in two threads. A call on one matrix asks for no workers.
+"""No LAPACK call on many matrices and no two calls at once: they can wait for each other's workers for ever on few
+cores, be they in one program or in two threads.
 
-Outside of ``lmi`` nothing calls LAPACK on JAX arrays; there, problems run one after another, a matrix a call.
+Outside of ``lmi`` nothing calls LAPACK on JAX arrays; there, problems run one after another, a matrix a call, and one
+call waits for the other.
 """
 
 import ast
@@ -12,13 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import USERS_OPTIONS
 from grasps import ball
-from lapack import lapack_calls
+from lapack import at_once, compiled_at_once, lapack_calls
 from motion import random_bodies, random_states
 
 import jaxgrasp as jg
 from jaxgrasp.conic import eigenvalues, left_svd, null_basis, pseudo_inverse, singular_values, solve
-from jaxgrasp.lmi import lmi_forces, lmi_margin
+from jaxgrasp.lmi import LMIProblem, lmi_feasibility, lmi_forces, lmi_margin, lmi_minimize, sdp_minimize
+from jaxgrasp.lmi.order import after
 from jaxgrasp.motion import Simulation, gramian
 from jaxgrasp.placement.objectives import EpsilonFloor
 from jaxgrasp.quality import grasp_isotropy, grasp_volume
@@ -35,6 +38,22 @@ def test_the_finder_finds_calls_wherever_they_are():
     assert lapack_calls(loop, x) == [("cholesky", 1)] * 2
     assert lapack_calls(jax.vmap(loop), x[None].repeat(4, 0)) == [("cholesky", 4)] * 2
     assert lapack_calls(jax.grad(lambda x: jnp.sum(svd(x))), x)[0] == ("svd", 1)
+
+
+def test_the_finder_finds_what_runs_at_once():
+    x = np.eye(3)
+    factor, svd = jnp.linalg.cholesky, functools.partial(jnp.linalg.svd, compute_uv=False)
+    assert at_once(lambda x: (factor(x), factor(2 * x)), x) == [("cholesky", "cholesky")]
+    assert at_once(lambda x: factor(factor(x)), x) == []
+    assert at_once(lambda x: (jax.jit(factor)(x), jax.vmap(svd)(x[None])), x) == [("cholesky", "svd")]
+    # A function in a function is written out: one of its results does not wait for the other.
+    two = jax.jit(lambda x: (factor(x), x + 1))
+    assert at_once(lambda x: factor(two(x)[1]), x) == [("cholesky", "cholesky")]
+    assert at_once(lambda x: factor(two(x)[0]), x) == []
+    loop = functools.partial(jax.lax.fori_loop, 0, 3, lambda _, x: factor(x) + factor(x.T))
+    assert at_once(loop, x) == [("cholesky", "cholesky")]
+    (pair,) = at_once(lambda x: (loop(x), factor(x))[0] + factor(x), x)[1:2]
+    assert pair[1] == "cholesky"
 
 
 def test_no_room_but_lmi_names_a_lapack_routine():
@@ -114,20 +133,63 @@ def test_programs_without_lapack(name):
     assert lapack_calls(FREE[name], grasps()) == []
 
 
-SINGLE = {
-    "lmi_margin": lmi_margin,
-    "gentlest by LMI": lambda g: lmi_forces(g, LOAD, criterion=jg.Gentlest()),
-    "robust by LMI": lambda g: lmi_forces(g, LOAD, criterion=jg.Robust(0.1)),
-    "squares by LMI": lambda g: lmi_forces(g, LOAD, criterion=jg.SumOfSquares(), max_normal=np.full(3, 9.0)),
-}
+def interval(count=2):
+    """``x >= 1, x <= 2``, some times."""
+    constant = np.broadcast_to(np.diag([-1.0, 2.0]), (count, 2, 2))
+    return np.ones((count, 1)), constant, np.broadcast_to(np.diag([1.0, -1.0]), (count, 1, 2, 2))
 
 
-@pytest.mark.parametrize("name", SINGLE)
-@pytest.mark.parametrize("batch", [True, False])
-def test_programs_with_one_matrix_a_call(name, batch):
-    found = lapack_calls(SINGLE[name], grasps() if batch else grasps()[0])
+def curved(cost, constant, matrices):
+    term = jg.lmi.LogDetTerm(np.ones(len(cost)), constant, matrices)
+    return lmi_minimize(LMIProblem(cost, constant, matrices, 1.5 * cost, np.ones((len(cost), 1, 1)), term))
+
+
+ORDERED = {
+    "lmi_margin": (lmi_margin, grasps),
+    "gentlest by LMI": (lambda g: lmi_forces(g, LOAD, criterion=jg.Gentlest()), grasps),
+    "robust by LMI": (lambda g: lmi_forces(g, LOAD, criterion=jg.Robust(0.1)), grasps),
+    "squares by LMI": (
+        lambda g: lmi_forces(g, LOAD, criterion=jg.SumOfSquares(), max_normal=np.full(3, 9.0)), grasps
+    ),
+    "lmi_feasibility": (lambda p: lmi_feasibility(*p[1:]), interval),
+    "lmi_minimize": (lambda p: curved(*p), interval),
+    "sdp_minimize": (lambda p: sdp_minimize(*p), interval),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ORDERED)
+@pytest.mark.parametrize("count", [1, 3])
+def test_programs_with_one_matrix_a_call_and_one_call_after_another(name, count):
+    function, given = ORDERED[name]
+    found = lapack_calls(function, given(count=count))
     assert len(found) > 5
     assert {matrices for _, matrices in found} == {1}
+    assert at_once(function, given(count=count)) == []
+
+
+@pytest.mark.parametrize("name", ["lmi_margin", "robust by LMI"])
+def test_compiled_programs_wait_too(name):
+    """No pass of the compiler takes the dependence for idle."""
+    function, given = ORDERED[name]
+    text = jax.jit(function).lower(given()).compile().as_text()
+    assert text.count('custom_call_target="lapack') > 5
+    assert compiled_at_once(text) == []
+
+
+@pytest.mark.parametrize("options", [None, USERS_OPTIONS], ids=["quick", "users"])
+def test_what_waits_by_a_count(options):
+    """``after`` makes one call wait for another at every level of optimisation; a product with zero would not."""
+    x, factor = np.eye(40), jnp.linalg.cholesky
+
+    def text(second):
+        def both(x, y):
+            first = factor(x)
+            return first, factor(second(y, first))
+
+        return jax.jit(both).lower(x, x).compile(options).as_text()
+
+    assert len(compiled_at_once(text(lambda y, first: y))) == 1
+    assert compiled_at_once(text(after)) == []
 
 
 # What stands for LAPACK --------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
+from ..backend import varying_like
 from ..core import (
     Answer,
     Array,
@@ -26,7 +27,7 @@ from ..core import (
 )
 from .combined import combine
 from .primal_dual import lmi_minimize, minimize
-from .problem import LMIProblem, bracket_words, expect_shape, over_batch
+from .problem import LMIProblem, LMISolution, bracket_words, expect_shape, over_batch
 from .proofs import find_ray, lower_bound, upper_bound
 
 __all__ = [
@@ -138,11 +139,8 @@ def lmi_feasibility(
     expect_shape(constant.shape[-2:] == (q, q), "constant", "(*batch, q, q)", constant)
     expect_shape(matrices.shape[-3:] == (N, q, q), "matrices", f"(*batch, N, {q}, {q})", matrices)
     goal = gap_goal(tolerance, matrices.dtype)
-
-    def one(problem: tuple[Array, Array]) -> LMIFeasibility:
-        return feasibility(problem[0], problem[1], goal)
-
-    return over_batch(one, (constant, matrices), (2, 3))
+    one = jax.custom_batching.sequential_vmap(feasibility)  # one after another, see primal_dual.minimize
+    return over_batch(lambda problem: one(*problem, goal), (constant, matrices), (2, 3))
 
 
 def _unit(matrices: Array) -> tuple[Array, Array]:
@@ -152,8 +150,8 @@ def _unit(matrices: Array) -> tuple[Array, Array]:
     return matrices / size[..., None, None], size
 
 
-def feasibility(constant: Array, matrices: Array, goal: Array) -> LMIFeasibility:
-    """One problem, no batch axes."""
+def _deepest(constant: Array, matrices: Array, goal: Array) -> tuple[LMISolution, Array]:
+    """The answer of ``lmi_feasibility``'s problem, and x."""
     N, q, dtype = matrices.shape[0], constant.shape[-1], matrices.dtype
     scaled, sizes = _unit(jnp.concatenate([constant[None], matrices]))
     # Variables (x_0, x_1 .. x_N, s); blocks: the LMI, x_0 - s, the unit ball.
@@ -169,17 +167,23 @@ def feasibility(constant: Array, matrices: Array, goal: Array) -> LMIFeasibility
     centre = jax.scipy.linalg.block_diag(jnp.zeros((q + 1, q + 1), dtype), ball_constant)
     down = jnp.zeros(N + 2, dtype).at[-1].set(-1.0)
     end = minimize(LMIProblem(down, centre, blocks, down), goal)
+    return end, end.x[1:-1] / end.x[0] * sizes[0] / sizes[1:]
 
+
+def feasibility(constant: Array, matrices: Array, goal: Array) -> LMIFeasibility:
+    """One problem, no batch axes."""
+    q, dtype = constant.shape[-1], matrices.dtype
+    end, x = _deepest(constant, matrices, goal)
     depth = -end.upper
-    x = end.x[1:-1] / end.x[0] * sizes[0] / sizes[1:]
     still = LMIProblem(jnp.zeros_like(x), constant, matrices, x)
     feasible = (depth > 0) & jnp.isfinite(upper_bound(combine(still), x))
     Z = end.dual[:q, :q]
     total = jnp.trace(Z)
     Z = Z / jnp.where(total > 0, total, 1.0)
-    # A cost of zero that is at least something positive: nothing is feasible.
-    least, _ = lower_bound(combine(still), Z, jnp.zeros(0, dtype))
+    # A cost of zero that is at least something positive: nothing is feasible. No question where x is.
+    least, _ = lower_bound(combine(still), jnp.where(feasible, 0.0, Z), jnp.zeros(0, dtype))
     rounding = rounding_constant() * q * unit_roundoff(dtype)
+    scaled, _ = _unit(jnp.concatenate([constant[None], matrices]))
     traces = jnp.einsum("iab,ab->i", scaled, Z)
     leak = jnp.sqrt(jnp.sum(traces[1:] ** 2)) + rounding
     reach = jnp.maximum(-traces[0] - rounding, 0.0) / leak
@@ -287,7 +291,8 @@ def _sequential_ray(u: Array, constant: Array, matrices: Array, wanted: Array) -
     def search() -> Array:
         blocks = jax.vmap(jax.scipy.linalg.block_diag)(matrices, -u[:, None, None])
         goal = gap_goal(1e-8, u.dtype)
-        ray = feasibility(jnp.zeros_like(blocks[0]), blocks, goal).x
+        _, ray = _deepest(jnp.zeros_like(blocks[0]), blocks, goal)
         return find_ray(combine(LMIProblem(u, constant, matrices, ray)), ray[None])
 
-    return jax.lax.cond(wanted, search, lambda: jnp.zeros_like(u))
+    none = varying_like((u, constant, matrices))(jnp.zeros_like(u))
+    return jax.lax.cond(wanted, search, lambda: none)

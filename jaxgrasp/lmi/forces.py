@@ -183,7 +183,8 @@ class _Reduced(eqx.Module):
 def _optimize(grasp: Grasp, criterion: Criterion, limit, torques, wrench: Array, goal: Array) -> LMIForces:
     reduced = _reduce(grasp, limit, torques, wrench)
     phase = feasibility(*_with_rows(reduced.constant, reduced.matrices, reduced.g, reduced.H), goal)
-    problem, scale, offset = _problem(grasp, criterion, reduced, phase.x)
+    start = nan_where(phase.status != Status.FEASIBLE.value, phase.x)
+    problem, scale, offset = _problem(grasp, criterion, reduced, start)
     end = minimize(problem, goal)
 
     force = reduced.size * reduced.force(end.x[: reduced.V.shape[1]])

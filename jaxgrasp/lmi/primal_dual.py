@@ -8,8 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ..backend import while_loop
 from ..core import Array, Status, gap_goal, unit_roundoff
 from .combined import Combined, Coordinates, combine, coordinates
+from .order import after
 from .problem import LMIProblem, LMISolution, check_shapes, over_batch
 from .proofs import find_ray, is_ray, lower_bound, upper_bound
 
@@ -50,7 +52,8 @@ def _symmetric(M: Array) -> Array:
 def _normal_solver(J: Array) -> Callable[[Array], Array]:
     """``b -> (J^T J)^-1 b`` from ``J = O R``: the square of J's condition number, which grows like t, never appears.
 
-    Columns are scaled to unit length. A variable nothing holds (a zero column) stays put.
+    Columns are scaled to unit length. A variable nothing holds (a zero column) stays put. R is inverted once, and what
+    that leaves out is made good by the refinements: every later direction is then a product, not a call of LAPACK.
     """
     N = J.shape[1]
     length = jnp.linalg.norm(J, axis=0)
@@ -59,14 +62,12 @@ def _normal_solver(J: Array) -> Callable[[Array], Array]:
     ridge = jnp.diag(jnp.where(length > 0, 8 * unit_roundoff(J.dtype), 1.0).astype(J.dtype))
     R = jnp.linalg.qr(jnp.concatenate([unit, ridge]), mode="r")
 
-    def once(right: Array) -> Array:
-        half = jax.scipy.linalg.solve_triangular(R, right, trans=1)
-        return jax.scipy.linalg.solve_triangular(R, half)
+    inverse = jax.scipy.linalg.solve_triangular(R, jnp.eye(N, dtype=J.dtype))
 
     def solve(b: Array) -> Array:
         x = jnp.zeros(N, J.dtype)
         for _ in range(1 + REFINEMENTS):
-            x = x + once(scale * b - unit.T @ (unit @ x))
+            x = x + inverse @ (inverse.T @ (scale * b - unit.T @ (unit @ x)))
         return scale * x
 
     return solve
@@ -122,8 +123,8 @@ def _step(
         return _symmetric(inverse @ (goal[:, None] * R)) - jnp.diag(values**2)
 
     def lengths(dS: Array, dZ: Array) -> tuple[Array, Array]:
-        primal = jnp.minimum(1.0, SHARE * _to_the_edge(root, dS))
-        dual = jnp.minimum(1.0, SHARE * _to_the_edge(root, dZ))
+        edges = jax.lax.map(lambda M: _to_the_edge(root, M), jnp.stack([dS, dZ]))  # a matrix a call
+        primal, dual = jnp.minimum(1.0, SHARE * edges)
         if problem.root.shape[0]:  # what the dual equations miss depends on x: one length for both
             primal = dual = jnp.minimum(primal, dual)
         return primal, dual
@@ -154,6 +155,7 @@ def minimize(problem: LMIProblem, goal: Array, max_steps: int = MAX_STEPS) -> LM
 
 
 def _minimize(given: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
+    given = after(given, given)  # the start too: what found it has ended
     problem = combine(given)
     space = coordinates(problem)
     dtype, q = given.cost.dtype, problem.order
@@ -167,10 +169,11 @@ def _minimize(given: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
 
     def advance(iterate: _Iterate) -> _Iterate:
         change, Z, direction, multipliers = _step(problem, space, iterate)
-        (lower, dual), x = lower_bound(problem, *multipliers), iterate.x + change
-        factor, dual_factor = jnp.linalg.cholesky(problem.S(x)), jnp.linalg.cholesky(Z)
+        lower, dual = lower_bound(problem, *after(multipliers, change))
+        x = after(iterate.x + change, lower)
+        factor, dual_factor = jax.lax.map(jnp.linalg.cholesky, jnp.stack([problem.S(x), Z]))
         usable = _finite(x, factor, dual_factor)
-        upper = jnp.where(usable, upper_bound(problem, x), jnp.inf)
+        upper = upper_bound(problem, jnp.where(usable, x, jnp.nan))
         tighter, cheaper = lower > iterate.lower, upper < iterate.upper
         gains = ~near(iterate.lower, lower) & tighter | cheaper & ~near(upper, iterate.upper)
         return _Iterate(
@@ -185,13 +188,14 @@ def _minimize(given: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
             direction=space.T @ direction,
             waited=jnp.where(gains, 0, iterate.waited + 1),
             steps=iterate.steps + 1,
-            ended=~usable | is_ray(problem, x),
+            ended=~usable | is_ray(problem, after(x, upper)),
         )
 
     slope = space.T.T @ (given.cost + problem.root.T @ (problem.root @ given.start))
     size = jnp.linalg.norm(slope)
     Z = START * jnp.where(size > 0, size, 1.0) * jnp.eye(len(problem.constant), dtype=dtype)
-    factor, upper = jnp.linalg.cholesky(problem.S(given.start)), upper_bound(problem, given.start)
+    factor = jnp.linalg.cholesky(problem.S(after(given.start, space.T)))
+    upper = upper_bound(problem, jnp.where(_finite(factor), given.start, jnp.nan))
     interior = _finite(factor, upper)  # else: not strictly feasible, or not numbers
     start = _Iterate(
         x=given.start,
@@ -207,7 +211,7 @@ def _minimize(given: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
         steps=jnp.zeros((), jnp.int32),
         ended=~(interior & space.held),  # not held: the cost falls for ever
     )
-    end = jax.lax.while_loop(unfinished, advance, start)
+    end = while_loop(unfinished, advance, start, (problem, space, goal))
     ray = find_ray(problem, jnp.stack([-space.idle, end.x, end.x - given.start, end.direction]))
     ray = jnp.where(interior & jnp.isneginf(end.lower), ray, 0.0)
     enough = jnp.maximum(goal, FLOOR * q * unit_roundoff(dtype))
@@ -215,7 +219,8 @@ def _minimize(given: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
     status = jnp.where(jnp.any(ray != 0), Status.UNBOUNDED.value, status)
     status = jnp.where(interior, status, Status.INVALID.value).astype(jnp.int32)
     lower = jnp.where(interior, jnp.minimum(end.lower, end.upper), -jnp.inf)
-    return LMISolution(status, end.best, end.upper, lower, end.dual[:q, :q], ray, end.steps)
+    best, upper, lower, dual = after((end.best, end.upper, lower, end.dual[:q, :q]), ray)
+    return LMISolution(status, best, upper, lower, dual, ray, end.steps)
 
 
 def _finite(*arrays: Array) -> Array:

@@ -84,7 +84,7 @@ def upper_bound(problem: Combined, x: Array) -> Array:
     feasible = surely_positive(S, error)
     B, error = S[problem.term, problem.term], error[problem.term, problem.term]
     if len(B):
-        values = jnp.linalg.eigvalsh(B)
+        values = jnp.linalg.eigvalsh(jnp.where(feasible, B, jnp.eye(len(B), dtype=dtype)))
         least = values - jnp.max(jnp.sum(error, axis=1)) - 4 * len(B) * eps * jnp.max(jnp.abs(values))
         counts = problem.weight > 0
         feasible = feasible & (~counts | jnp.all(least > 0))
@@ -144,7 +144,7 @@ def _lower_bound(problem: Combined, Z: Array, v: Array, units: Array) -> tuple[A
     terms = jnp.sum(products != 0) + 1
     Y, w = Z[problem.term, problem.term], problem.weight
     if len(Y):
-        values = jnp.linalg.eigvalsh(Y)
+        values = jnp.linalg.eigvalsh(jnp.where(proved, Y, jnp.eye(len(Y), dtype=dtype)))
         least = values - rho - 4 * len(Y) * eps * jnp.max(jnp.abs(values))
         counts = w > 0
         proved = proved & (~counts | jnp.all(least > 0))
