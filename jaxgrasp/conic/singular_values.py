@@ -41,19 +41,16 @@ def _dot(x: Array, y: Array) -> Array:
 
 
 @stage
-def _products(x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """|x|^2, |y|^2 and x.y, computed once: an x.y that one reader takes for zero and another not turns rows that are
-    orthogonal already by any angle."""
-    return _dot(x, x), _dot(y, y), _dot(x, y)
+def _rotation(x: Array, y: Array) -> tuple[Array, Array]:
+    """Cosine and sine of the rotations that make the rows x and y orthogonal, pair by pair.
 
-
-@stage
-def _rotation(alpha: Array, beta: Array, gamma: Array) -> tuple[Array, Array]:
-    """Cosine and sine of the rotations that make pairs of rows with these products orthogonal."""
-    zeta = (beta - alpha) / (2 * jnp.where(gamma != 0, gamma, jnp.ones_like(gamma)))
-    sign = jnp.where(zeta >= 0, jnp.ones_like(zeta), -jnp.ones_like(zeta))
-    t = sign / (jnp.abs(zeta) + jnp.sqrt(1 + zeta * zeta))
-    t = jnp.where((gamma != 0) & jnp.isfinite(zeta), t, jnp.zeros_like(t))
+    ``t = 2 x.y / (d +- sqrt(d^2 + 4 (x.y)^2))``, d = |y|^2 - |x|^2. It follows x.y continuously: a compiler may compute
+    x.y twice, and rounding make it zero once.
+    """
+    gamma, d = _dot(x, y), _dot(y, y) - _dot(x, x)
+    size = jnp.abs(d) + jnp.sqrt(d * d + 4 * gamma * gamma)
+    t = 2 * gamma / jnp.where(size > 0, size, jnp.ones_like(size))
+    t = jnp.where(d >= 0, t, -t)
     c = 1 / jnp.sqrt(1 + t * t)
     return c[:, None], (c * t)[:, None]
 
@@ -66,7 +63,7 @@ def _rotated(x: Array, y: Array, c: Array, s: Array) -> tuple[Array, Array]:
 def _round(halves: tuple[Array, Array], width: int) -> tuple[Array, Array]:
     """Rotate the pairs (upper[i], lower[i]), then move everyone but the first one seat round the table."""
     upper, lower = halves
-    c, s = _rotation(*_products(upper[:, :width], lower[:, :width]))
+    c, s = _rotation(upper[:, :width], lower[:, :width])
     upper, lower = _rotated(upper, lower, c, s)
     return (
         jnp.concatenate([upper[:1], lower[:1], upper[1:-1]], axis=0),

@@ -1,8 +1,5 @@
 """How the tests compile: quickly, without optimisation; and how users do."""
 
-import os
-import subprocess
-import sys
 from importlib.metadata import version
 
 LEVEL_FLAG = "--xla_backend_optimization_level"
@@ -22,18 +19,3 @@ def quick_flags(level: str) -> list[str]:
         flags.append("--xla_llvm_disable_expensive_passes=true")
         flags += ["--xla_cpu_use_fusion_emitters=false"] * OLD_EMITTERS
     return flags
-
-
-def at_level_0() -> bool:
-    """Whether this process compiles without optimisation and with the older emitters."""
-    return OLD_EMITTERS and f"{LEVEL_FLAG}=0" in os.environ.get("XLA_FLAGS", "")
-
-
-def run_at_users_level(test: str) -> None:
-    """One test in a process of its own that compiles as users do."""
-    quick = quick_flags("0")
-    flags = [flag for flag in os.environ.get("XLA_FLAGS", "").split() if flag not in quick]
-    environment = {**os.environ, "XLA_FLAGS": " ".join(flags), "JAXGRASP_TEST_OPTIMIZATION": "3"}
-    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-m", "", "-p", "no:cacheprovider", test]
-    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=900, check=False)
-    assert run.returncode == 0, run.stdout[-3000:] + run.stderr[-1000:]
