@@ -133,9 +133,9 @@ def _held(
     room = np.maximum(blur, ENDS * EPS * size)
     limits = 3 * claim.s.shape[1] + 2 * asked.torque.shape[-1]
     allowed = np.maximum(tolerance * size, 4 * (smoothing / posed.cost_unit) * limits) + 4 * room
+    ordered = asked.valid & (claim.lower <= claim.upper)
     # Where squares overflow nothing is compared.
-    ordered = asked.valid & (claim.lower <= claim.upper) & np.isfinite(blur)
-    said = np.abs(value - claim.upper) <= blur
+    said = np.isfinite(blur) & (np.abs(value - claim.upper) <= blur)
 
     def fits(shown: Shown) -> np.ndarray:
         cheap = said & np.isfinite(shown.upper)
@@ -207,10 +207,11 @@ def _pulled_in(
     """Forces inside all limits of a problem next to the one given, and how far its numbers lie, over their size.
 
     Friction, caps, torques and J may be better by ``near`` at most; what is still outside is pulled onto its cone or
-    cap, and balances another load. Of the forces as given and of those balanced again, the nearer.
+    cap, and balances another load. The forces as given, if they are near enough, else the nearest: where the rank is
+    not full, forces balanced again may be far from those given.
     """
     best, least = given, np.full(len(given), np.inf)
-    live, lanes = asked.known.live, len(given)
+    live = asked.known.live
     for s in (given, balanced):
         tail = np.linalg.norm(s[..., 1:], axis=-1)
         for better in (0.0, near / 2, near * (1 - 1 / 64)):
@@ -220,14 +221,13 @@ def _pulled_in(
                 reached > 0, np.minimum(1.0, head * (1 + better) / np.where(reached > 0, tail, 1.0)), 1.0
             )
             inside = np.concatenate([head[..., None], s[..., 1:] * shrink[..., None]], -1)
+            used = np.where((head > asked.cap) | (reached > 0), better, 0.0).max(-1, initial=0.0)
             distance = np.maximum(_missing_load(asked, inside), _missing_torque(asked, inside))
-            used = np.max(np.where(head > asked.cap, better, 0.0), -1, initial=0.0)
-            used = np.maximum(used, np.max(np.where(reached > 0, better, 0.0), -1, initial=0.0))
             distance = np.maximum(distance, used) + 2 * EPS
-            closer = distance < least
+            closer = (distance < least) & (least > near)
             best = np.where(closer[:, None, None], inside, best)
             least = np.where(closer, distance, least)
-    return best.reshape(lanes, *given.shape[1:]), least
+    return best, least
 
 
 def _missing_load(asked: Asked, s: np.ndarray) -> np.ndarray:

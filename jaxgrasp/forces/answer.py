@@ -130,6 +130,16 @@ def _violation(program: ConvexConeProgram, u: Cone) -> Array:
 
 
 @stage
+def _imbalance(folded: Folded, u: Cone, load: Load) -> Array:
+    """``|A s + w| / (|A| |s| + |w|)`` on A itself (L,): the basis of the solver may be worse conditioned."""
+    size = folded.norm * jnp.sqrt(cone_sum(folded.exists * inner(u, u))) * load.size + vector_norm(
+        load.wrench
+    )
+    rest = vector_norm(load.size * matvec(folded.columns, u) + load.wrench)
+    return rest / jnp.where(size > 0, size, jnp.ones_like(size))
+
+
+@stage
 def _depth(program: ConvexConeProgram, u: Cone) -> Array:
     """How far u is inside the cones, relative to the largest force (L,)."""
     largest = cone_max(program.exists * jnp.abs(u[0]))
@@ -177,7 +187,8 @@ def answer(problem: ForceProblem, state: ConvexState, tolerance: Array) -> Answe
     found = Multipliers(rows, ray, to_twist(projection, rows[:m]), to_twist(projection, ray[:m]))
     values = _values(problem, state.point, u, found)
     load = load._replace(rest=load.rest & (problem.demand.criterion.barrier_weight is None))
-    admissible = (_violation(program, u) <= edge_tolerance(dtype)) & jnp.isfinite(values.cost) & ~load.off
+    worst = jnp.maximum(_violation(program, u), _imbalance(problem.tile.folded, u, load))
+    admissible = (worst <= edge_tolerance(dtype)) & jnp.isfinite(values.cost) & ~load.off
     if problem.demand.criterion.barrier_weight is not None:
         admissible = admissible & (_depth(program, u) >= BARRED * unit_roundoff(dtype))
     status = _status(

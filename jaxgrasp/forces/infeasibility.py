@@ -17,6 +17,7 @@ from .problem import Load
 __all__ = ["proven_separation", "proves", "separation"]
 
 FORCE_LIMIT = 1e9  # loads: forces up to this many must be ruled out before infeasible counts as proven
+POWER = 5000  # units of rounding, of |twist| |load|: less power may be rounding of numbers, as far as a checker knows
 
 
 @stage
@@ -51,9 +52,11 @@ def proven_separation(
 ) -> Array:
     """Power of the load along ``twist`` less what forces up to ``limit`` loads and the torques can take up, on A.
 
-    Positive: the twist proves INFEASIBLE. Allows twice for the rounding the checker allows for, in its float64.
+    Positive: the twist proves INFEASIBLE. Allows twice for the rounding the checker allows for, in its float64; a power
+    that is none but for rounding in the dtype at work proves nothing.
     """
     rounding = rounding_constant() * unit_roundoff("float64")
+    noise = max(rounding, POWER * unit_roundoff(folded.norm.dtype))
     x, blur = rmatvec(folded.columns, twist), folded.norm * vector_norm(twist)
     if beta is not None:
         joints = tuple(c[program.rhs.shape[0] :] for c in program.columns)
@@ -68,4 +71,4 @@ def proven_separation(
     if beta is not None:
         taken = taken + cone_sum(jnp.abs(beta) * program.bound) * load.size
     power = vector_inner(twist, load.wrench)
-    return power - rounding * vector_norm(twist) * outer - taken
+    return power - noise * vector_norm(twist) * outer - taken
