@@ -141,7 +141,8 @@ def _held(
         cheap = said & np.isfinite(shown.upper)
         # A lower end alone must not gain by forces that are far too large.
         near = np.abs(shown.lower) if asked.weight is None else np.abs(shown.lower) + asked.weight
-        dear = claim.lower <= shown.lower + np.minimum(room, max(fine, ENDS * EPS) * near)
+        alone = np.minimum(room, max(fine, ENDS * EPS) * near)
+        dear = claim.lower <= shown.lower + np.where(cheap, room, alone)
         width = np.maximum(claim.upper, shown.upper) - np.minimum(claim.lower, shown.lower)
         optimal = (claim.status == OPTIMAL) & cheap & dear & (width <= allowed)
         stalled = (claim.status == STALLED) & (dear | (claim.lower == -np.inf))
