@@ -35,3 +35,18 @@ def is_semidefinite(matrix: np.ndarray) -> bool:
             M[k + 1 :, k + 1 :] = (pivot * M[k + 1 :, k + 1 :] - np.multiply.outer(row, row)) // before
             before = pivot
     return True
+
+
+def is_ray(u: np.ndarray, matrices: np.ndarray, ray: np.ndarray) -> bool:
+    """``u.ray < 0``, ``sum_i ray_i S_i >= 0``: from a feasible point the cost falls for ever."""
+    cost, along = whole(u, ray)
+    return bool(cost @ along < 0) and is_semidefinite(at(ray, 0 * matrices[0], matrices))
+
+
+def excludes_all(constant: np.ndarray, matrices: np.ndarray, Z: np.ndarray) -> bool:
+    """``tr(S_i Z) = 0``, ``tr(S_0 Z) < 0`` for a Z >= 0 next to this one: no x has ``S(x) >= 0``."""
+    rest = np.linalg.norm(np.einsum("iab,ab->i", matrices, Z))
+    columns = matrices.reshape(len(matrices), -1)
+    change = 2 * rest / np.linalg.svd(columns, compute_uv=False)[-1]  # that makes the traces exactly zero
+    inside = is_semidefinite(at(np.array([-change]), Z, np.eye(len(Z))[None]))
+    return inside and bool(np.sum(constant * Z) + change * np.linalg.norm(constant) < 0)
