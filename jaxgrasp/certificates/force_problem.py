@@ -59,6 +59,14 @@ def _spread(
     raise ValueError(f"{name} of shape {np.shape(value)} does not fit problems of shape {(*shape, *own)}")
 
 
+def _parameter(
+    criterion: Any, name: str, batch: tuple[int, ...], shape: tuple[int, ...]
+) -> np.ndarray | None:
+    """A number of the criterion for all problems (N,); None where it has none."""
+    value = getattr(criterion, name, None)
+    return None if value is None else _spread(value, (), batch, shape, f"the criterion's {name}")
+
+
 def _in_contact_axes(grasp, torque_limits) -> tuple[Any, Any]:
     """(J, tau_max) for forces in contact axes; J in body or world axes is turned here, ``J_contact = B^T J``."""
     axes = getattr(torque_limits, "axes", None)
@@ -127,20 +135,15 @@ def force_problem(grasp, problem) -> ForceProblem:
         torque = _spread(tau, (joints,), batch, shape, "tau_max")
         valid &= (torque > 0).all(-1) & (np.isfinite(jacobian).all((-1, -2)) | ~live).all(-1)
         jacobian = np.where(live[..., None, None], jacobian, 0.0)
-    parameters: dict[str, np.ndarray | None] = {"weight": None, "length": None}
-    for name in parameters:
-        given = getattr(problem.criterion, name, None)
-        if given is not None:
-            value = _spread(given, (), batch, shape, f"the criterion's {name}")
-            valid &= np.isfinite(value) & (value > 0)
-            parameters[name] = value
+    weight, length = (_parameter(problem.criterion, name, batch, shape) for name in ("weight", "length"))
+    for value in (weight, length):
+        valid &= value is None or (np.isfinite(value) & (value > 0))
 
     with np.errstate(all="ignore"):
         load = scaled_wrench(wrench, known.length, dimension)
         size = np.max(np.abs(load), -1, initial=0.0)
         limit = _load_limit(np.dtype(grasp.position.dtype))
         valid &= ((size >= 1 / limit) & (size <= limit)) | ~wrench.any(-1)
-        weight = parameters["weight"]
         unit = _power_of_two(size)
         if weight is not None:  # a barrier's logarithms are those of newtons
             unit = np.ones_like(unit)
@@ -148,7 +151,7 @@ def force_problem(grasp, problem) -> ForceProblem:
             known=known,
             name=type(problem.criterion).__name__,
             weight=None if weight is None else weight / unit,
-            length=parameters["length"],
+            length=length,
             cap=np.where(live, cap / unit[:, None], np.inf),
             jacobian=jacobian,
             torque=torque / unit[:, None],

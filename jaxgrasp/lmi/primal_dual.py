@@ -99,14 +99,7 @@ def _step(
     solve = _normal_solver(J)
     image = problem.root @ iterate.x
     slope = space.T.T @ problem.cost
-
-    # Multipliers for a bound: the equations met by the shortest change in the scaled norm.
-    Z, v = iterate.Z, -image
-    for _ in range(POLISHINGS):
-        change = solve(slope - _inner(space.matrices, Z) - space.root.T @ v)
-        Z = _symmetric(Z + inverse.T @ jnp.einsum("i,iab->ab", change, W) @ inverse)
-        v = v + space.root @ change
-
+    multipliers = _multipliers(space, solve, W, inverse, slope, (iterate.Z, -image))
     rest = slope + space.root.T @ image - _inner(space.matrices, iterate.Z)
     rows = jnp.arange(size)
     pushed = (rows >= problem.order) & (problem.weight > 0)  # rows that are kept at w
@@ -144,7 +137,20 @@ def _step(
     dx, dS, dZ = direction(centre(sigma * mu) - shorter**2 * _symmetric(dS @ dZ))
     primal, dual = lengths(dS, dZ)
     moved = _symmetric(iterate.Z + dual * inverse.T @ dZ @ inverse)
-    return primal * (space.T @ dx), moved, dx, (Z, v)
+    return primal * (space.T @ dx), moved, dx, multipliers
+
+
+def _multipliers(
+    space: Coordinates, solve: Callable[[Array], Array], W: Array, inverse: Array, slope: Array,
+    given: tuple[Array, Array],
+) -> tuple[Array, Array]:  # fmt: skip
+    """Z and v for a bound: the equations met by the shortest change in the scaled norm."""
+    Z, v = given
+    for _ in range(POLISHINGS):
+        change = solve(slope - _inner(space.matrices, Z) - space.root.T @ v)
+        Z = _symmetric(Z + inverse.T @ jnp.einsum("i,iab->ab", change, W) @ inverse)
+        v = v + space.root @ change
+    return Z, v
 
 
 def minimize(problem: LMIProblem, goal: Array, max_steps: int = MAX_STEPS) -> LMISolution:
@@ -191,26 +197,8 @@ def _minimize(given: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
             ended=~usable | is_ray(problem, after(x, upper)),
         )
 
-    slope = space.T.T @ (given.cost + problem.root.T @ (problem.root @ given.start))
-    size = jnp.linalg.norm(slope)
-    Z = START * jnp.where(size > 0, size, 1.0) * jnp.eye(len(problem.constant), dtype=dtype)
-    factor = jnp.linalg.cholesky(problem.S(after(given.start, space.T)))
-    upper = upper_bound(problem, jnp.where(_finite(factor), given.start, jnp.nan))
-    interior = _finite(factor, upper)  # else: not strictly feasible, or not numbers
-    start = _Iterate(
-        x=given.start,
-        Z=Z,
-        factor=factor,
-        dual_factor=jnp.sqrt(Z),
-        best=given.start,
-        upper=jnp.where(interior, upper, jnp.nan),
-        lower=jnp.full((), -jnp.inf, dtype),
-        dual=jnp.zeros_like(Z),
-        direction=jnp.zeros_like(given.start),
-        waited=jnp.zeros((), jnp.int32),
-        steps=jnp.zeros((), jnp.int32),
-        ended=~(interior & space.held),  # not held: the cost falls for ever
-    )
+    start = _begin(problem, space, given.start)
+    interior = jnp.isfinite(start.upper)
     end = while_loop(unfinished, advance, start, (problem, space, goal))
     ray = find_ray(problem, jnp.stack([-space.idle, end.x, end.x - given.start, end.direction]))
     ray = jnp.where(interior & jnp.isneginf(end.lower), ray, 0.0)
@@ -221,6 +209,30 @@ def _minimize(given: LMIProblem, goal: Array, max_steps: int) -> LMISolution:
     lower = jnp.where(interior, jnp.minimum(end.lower, end.upper), -jnp.inf)
     best, upper, lower, dual = after((end.best, end.upper, lower, end.dual[:q, :q]), ray)
     return LMISolution(status, best, upper, lower, dual, ray, end.steps)
+
+
+def _begin(problem: Combined, space: Coordinates, x: Array) -> _Iterate:
+    """At x; ``upper`` is NaN where x is not strictly feasible, or not numbers."""
+    slope = space.T.T @ (problem.cost + problem.root.T @ (problem.root @ x))
+    size = jnp.linalg.norm(slope)
+    Z = START * jnp.where(size > 0, size, 1.0) * jnp.eye(len(problem.constant), dtype=x.dtype)
+    factor = jnp.linalg.cholesky(problem.S(after(x, space.T)))
+    upper = upper_bound(problem, jnp.where(_finite(factor), x, jnp.nan))
+    interior = _finite(factor, upper)  # else: not strictly feasible, or not numbers
+    return _Iterate(
+        x=x,
+        Z=Z,
+        factor=factor,
+        dual_factor=jnp.sqrt(Z),
+        best=x,
+        upper=jnp.where(interior, upper, jnp.nan),
+        lower=jnp.full((), -jnp.inf, x.dtype),
+        dual=jnp.zeros_like(Z),
+        direction=jnp.zeros_like(x),
+        waited=jnp.zeros((), jnp.int32),
+        steps=jnp.zeros((), jnp.int32),
+        ended=~(interior & space.held),  # not held: the cost falls for ever
+    )
 
 
 def _finite(*arrays: Array) -> Array:
