@@ -4,7 +4,8 @@
 
 The problems are those of ``tests/tables/force_problems.py``: random grasps of all kinds, loads that are any, balanced
 well inside the cones, balanced on their edge, or just beyond it; every criterion, with and without caps and torque
-limits. Rows tell grasps of full rank (smallest singular value above 1e-9 of the largest) from the others.
+limits. Rows tell grasps of full rank (smallest singular value above 1e-9 of the largest) in general position from those
+that a symmetry, or a load on an edge of the cones, makes special, and both from grasps whose rank is not full.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ COLUMNS = [f"{status.name} {how}" for status in STATUSES for how in ("exactly", 
 
 
 def measure(name: str, limits: bool, criterion: str, count: int, seed: int) -> tuple[np.ndarray, float]:
-    """Counts (2, 9), full rank and not, by status and proof; seconds a proof."""
+    """Counts (3, 9), by status and proof: general position, special, rank not full; seconds a proof."""
     grasp, _, wrench, cap, torque = force_problems.problems(name, limits, count, seed)
     make, parameter = force_problems.CRITERIA[criterion]
     asked = {"criterion": make(parameter), "max_normal": cap, "torque_limits": torque}
@@ -46,11 +47,11 @@ def measure(name: str, limits: bool, criterion: str, count: int, seed: int) -> t
     values = np.linalg.svd(np.asarray(jg.contacts.folded_grasp_map(grasp)), compute_uv=False)
     m = 3 if grasp.dimension == 2 else 6
     full = values[:, m - 1] > 1e-9 * values[:, 0] if values.shape[1] >= m else np.zeros(count, bool)
-    status = np.asarray(answer.status)
+    status, general = np.asarray(answer.status), force_problems.in_general_position(name, count, seed)
     return np.array(
         [
             [((status == s) & (proof == p) & here).sum() for s in STATUSES for p in PROOFS]
-            for here in (full, ~full)
+            for here in (full & general, full & ~general, ~full)
         ]
     ), seconds
 
@@ -67,7 +68,7 @@ def main() -> None:
     parser.add_argument("--models", nargs="+", default=list(force_problems.MODELS))
     options = parser.parse_args()
     lines = [
-        "| problem | rank | us a proof | " + " | ".join(COLUMNS) + " |",
+        "| problem | position | us a proof | " + " | ".join(COLUMNS) + " |",
         "| --- | --- |" + " ---: |" * 10,
     ]
     figures: dict[str, Any] = {}
@@ -82,7 +83,7 @@ def main() -> None:
                     float(np.median([run[1] for run in runs])),
                 )
                 title = f"{name}, {criterion}{', limits' if limits else ''}"
-                for row, rank in zip(total, ("full", "not full"), strict=True):
+                for row, rank in zip(total, ("general", "special", "not full"), strict=True):
                     text = " | ".join(str(x) for x in row)
                     lines.append(f"| {title} | {rank} | {1e6 * seconds:.0f} | {text} |")
                     print(lines[-1], flush=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from grasps import random_active, random_coefficients, random_contacts
+from grasps import KINDS, random_active, random_coefficients, random_contacts
 
 import jaxgrasp as jg
 
@@ -21,6 +21,18 @@ CRITERIA = {
     "sum of squares": (lambda x: jg.SumOfSquares(), None),
     "least norm": (lambda x: jg.LeastNorm(x), 0.2),
 }
+
+
+def in_general_position(name, count, seed):
+    """(count,) bool: those of ``problems`` that no symmetry and no load on an edge makes special."""
+    _, dimension = MODELS[name]
+    rng = np.random.default_rng(seed)  # drawn as there
+    *_, kind = random_contacts(rng, count, K, dimension)
+    random_coefficients(rng, count, K)
+    random_active(rng, count, K)
+    rng.normal(size=(count, 3 if dimension == 2 else 6))
+    load = rng.integers(4, size=count)
+    return np.isin([KINDS[i] for i in kind], ("tilted", "scatter", "half space", "remote")) & (load != 2)
 
 
 def problems(name, limits, count, seed):
