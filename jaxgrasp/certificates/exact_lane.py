@@ -104,10 +104,13 @@ class ExactLane:
         return residual if shown >= lower - self.nearby else np.inf
 
     def at_most_nearby(self, upper: float) -> float:
-        """How far a map lies of which the bound twist shows t* = -inf: all contacts move alike, along their normals."""
+        """How far a map lies, contact by contact and relatively, of which the bound twist shows t* = -inf: all contacts
+        move alike, along their normals."""
         if upper != -np.inf or not np.isfinite(self.bound).all():
             return np.inf
         x = (self.scaled.A.T @ self.bound).reshape(self.s.shape)
         mean = float(x[:, 0].mean())
-        off = max(float(np.abs(x[:, 0] - mean).max()), float(np.abs(x[:, 1:]).max(initial=0.0)))
-        return off / mean if mean > 0 else np.inf
+        x[:, 0] -= mean
+        size = np.linalg.norm(self.scaled.A, axis=0).reshape(self.s.shape)
+        off = np.linalg.norm(x, axis=-1) / np.linalg.norm(size, axis=-1)
+        return float(off.max()) if mean > self.nearby * float(size[:, 0].max()) else np.inf
