@@ -47,8 +47,8 @@ def number(value):
     """The exact value of a hexadecimal float, or of a list of them."""
     parts, total = value if isinstance(value, list) else [value], Q(0)
     require(len(parts) <= MOST_PARTS, "a number of too many parts")
-    for part in parts:
-        require(isinstance(part, str) and NUMBER.fullmatch(part), f"no hexadecimal float: {ascii(part)[:40]}")
+    for part in (x if isinstance(x, str) else type(x).__name__ for x in parts):
+        require(NUMBER.fullmatch(part), f"no hexadecimal float: {part[:40]!a}")
         exponent = int(part.split("p")[1])
         require(-1023 < exponent < 1024 and float.fromhex(part).hex() == part, f"{part} is no float64")
         total += Q(float.fromhex(part))

@@ -25,6 +25,7 @@ class Asked(NamedTuple):
 
     known   the grasps          name, weight, length   the criterion (weight, length (N,) or None)
     cap     (N, k)              jacobian (N, k, n, q)  J of forces, torque (N, q): limits; q may be 0
+    turned  (N, k, n, q)        sizes that the rounding of J is relative to: before it was turned, where it was
     load    (N, m) w            valid (N,)             the numbers are a problem
     dimension  2 or 3
     """
@@ -35,16 +36,24 @@ class Asked(NamedTuple):
     length: np.ndarray | None
     cap: np.ndarray
     jacobian: np.ndarray
+    turned: np.ndarray
     torque: np.ndarray
     load: np.ndarray
     valid: np.ndarray
     dimension: int
 
-    def scaled_jacobian(self) -> np.ndarray:
-        """J of scaled forces, normal first."""
+    def _scaled(self, rows: np.ndarray) -> np.ndarray:
         n, index = len(self.known.components), self.known.normal_index
         order = [index, *(j for j in range(n) if j != index)]
-        return (self.jacobian * self.known.scale[..., None])[:, :, order]
+        return (rows * self.known.scale[..., None])[:, :, order]
+
+    def scaled_jacobian(self) -> np.ndarray:
+        """J of scaled forces, normal first."""
+        return self._scaled(self.jacobian)
+
+    def reach(self) -> np.ndarray:
+        """(N, k, q) the size of J of scaled forces, which its rounding is relative to."""
+        return np.linalg.norm(self._scaled(self.turned), axis=2)
 
     def joint_work(self, rates: np.ndarray) -> np.ndarray:
         """``sum_j |beta_j| tau_j`` (N,): infinite where a joint without a limit moves, nothing where it does not."""

@@ -74,11 +74,11 @@ def _claim(answer, batch: tuple[int, ...], known: Rebuilt, m: int) -> Claim:
     forces, facets, norm = said.array("forces"), said.array("facets"), getattr(answer, "norm", None)
     if not isinstance(norm, str) or norm not in NORMS or forces.ndim != len(batch) + 2:
         raise Malformed("forces or norm")
-    if facets.dtype.kind not in "iu" or facets.shape != (*batch, *facets.shape[-2:-1], m):
+    if facets.dtype.kind not in "iu" or facets.shape != (*batch, *facets.shape[-2:][:1], m):
         raise Malformed("facets")
     vertices = forces.shape[-2]
     return Claim(
-        said.numbers("status"),
+        said.integers("status"),
         said.numbers("lower"),
         said.numbers("upper"),
         said.numbers("torque_scale"),
@@ -157,7 +157,7 @@ class _Lane:
         facets = self.claim.facets[self.lane]
         facets = facets[facets[:, 0] >= 0]
         s, fits = self._unit_effort(self.claim.forces[self.lane])
-        if not fits or not len(facets):
+        if not fits or not len(facets) or not len(s):
             return 0.0
         points = np.einsum("kmn,vkn->vm", self.blocks, s)
         terms = s.shape[1] * s.shape[2] + 24

@@ -25,13 +25,16 @@ STEPS = tuple(2.0**-e for e in (52, 48, 44, 40, 34, 28))
 def escape_twist(grasp: ExactGrasp, lane: Scaled, xi: np.ndarray) -> Twist | None:
     """A twist that no contact can oppose, exactly: xi (m,) itself, or one within rounding of it; lengths over L.
 
-    Three attempts: as it is; at rest exactly at the contacts it hardly moves; a little further inside the cones.
+    Three attempts: as it is; at rest exactly at the contacts it hardly moves; a little further inside the cones. None
+    where a contact clearly opposes xi: a twist far from it is no proof of what was said.
     """
     direct = twist_of(grasp, _physical(lane, grasp.dimension, xi))
     if grasp.escapes(direct):
         return direct
     x = _velocities(lane, xi)
     size = float(np.linalg.norm(lane.A) * np.linalg.norm(xi))
+    if not (x[:, 0] - np.linalg.norm(x[:, 1:], axis=-1) >= -EDGE * size).all():
+        return None
     unseen = np.linalg.norm(x, axis=-1) <= UNSEEN * size
     if unseen.any():
         still = _at_rest(grasp, direct, np.flatnonzero(unseen))
@@ -211,7 +214,7 @@ def _contact_distance(grasp: ExactGrasp, lane: Scaled, twist: Twist, i: int, mu:
         elif h >= 0:
             sliding = Fraction(speed * nn - h * h, nn)
             if sliding > 0:
-                limit = float(root_below(Fraction(h * h, nn) / sliding, 20)) if h else 0.0
+                limit = float(min(root_below(Fraction(h * h, nn) / sliding, 20), Fraction(2) ** 1000))
                 ways.append(max(mu - limit * (1 - 1e-15), gamma))
     area = speed * spin - dot(u, turn) ** 2
     if area and twisting > 0.0:  # the normal turns until the contact slides and does not twist: torsion stays

@@ -67,19 +67,25 @@ def _parameter(
     return None if value is None else _spread(value, (), batch, shape, f"the criterion's {name}")
 
 
-def _in_contact_axes(grasp, torque_limits) -> tuple[Any, Any]:
-    """(J, tau_max) for forces in contact axes; J in body or world axes is turned here, ``J_contact = B^T J``."""
+def _in_contact_axes(grasp, torque_limits) -> tuple[Any, Any, Any]:
+    """(J, |J|, tau_max) for forces in contact axes; J in body or world axes is turned here, ``J_contact = B^T J``.
+
+    |J| bounds each entry before and after: what the rounding of the turn is relative to.
+    """
     axes = getattr(torque_limits, "axes", None)
     if axes is None:
-        return torque_limits
+        J, torque = torque_limits
+        return J, np.abs(np.asarray(J, np.float64)), torque
     jacobian, torque = np.asarray(torque_limits.jacobian, np.float64), torque_limits.torque
     if axes == "contact":
-        return jacobian, torque
+        return jacobian, np.abs(jacobian), torque
     B = component_vectors(grasp, torque_limits.orientation if axes == "world" else None)
     k, r, n = B.shape[-3:]
     rows = jacobian.reshape(*jacobian.shape[:-2], k, r, jacobian.shape[-1])
     turned = np.einsum("...krn,...krq->...knq", B, rows)
-    return turned.reshape(*turned.shape[:-3], k * n, turned.shape[-1]), torque
+    size = np.broadcast_to(np.linalg.norm(rows, axis=-2, keepdims=True), turned.shape)
+    shape = (*turned.shape[:-3], k * n, turned.shape[-1])
+    return turned.reshape(shape), size.reshape(shape), torque
 
 
 def _repeated(known: Rebuilt, loads: int) -> Rebuilt:
@@ -127,14 +133,17 @@ def force_problem(grasp, problem) -> ForceProblem:
         cap = _spread(np.broadcast_to(value, (*value.shape[:-1], k)), (k,), batch, shape, "max_normal")
         valid &= ((cap > 0) | ~live).all(-1)
     jacobian, torque = np.zeros((len(live), k, n, 0)), np.zeros((len(live), 0))
+    turned = jacobian
     if problem.torque_limits is not None:
-        J, tau = _in_contact_axes(grasp, problem.torque_limits)
+        J, sizes, tau = _in_contact_axes(grasp, problem.torque_limits)
         joints = np.shape(J)[-1]
         tau = np.broadcast_to(tau, (*np.shape(tau)[:-1], joints))
-        jacobian = _spread(J, (k * n, joints), batch, shape, "J").reshape(-1, k, n, joints)
+        jacobian, turned = (
+            _spread(x, (k * n, joints), batch, shape, "J").reshape(-1, k, n, joints) for x in (J, sizes)
+        )
         torque = _spread(tau, (joints,), batch, shape, "tau_max")
         valid &= (torque > 0).all(-1) & (np.isfinite(jacobian).all((-1, -2)) | ~live).all(-1)
-        jacobian = np.where(live[..., None, None], jacobian, 0.0)
+        jacobian, turned = (np.where(live[..., None, None], x, 0.0) for x in (jacobian, turned))
     weight, length = (_parameter(problem.criterion, name, batch, shape) for name in ("weight", "length"))
     for value in (weight, length):
         valid &= value is None or (np.isfinite(value) & (value > 0))
@@ -154,6 +163,7 @@ def force_problem(grasp, problem) -> ForceProblem:
             length=length,
             cap=np.where(live, cap / unit[:, None], np.inf),
             jacobian=jacobian,
+            turned=turned,
             torque=torque / unit[:, None],
             load=np.where(valid[:, None], load / unit[:, None], 0.0),
             valid=valid,

@@ -78,16 +78,20 @@ def prove_forces(grasp, answer, problem, tolerance: float | None = None) -> Proo
         level, shown = _held(posed, claim, eps, close, getattr(problem, "smoothing", 0.0))
         lost = asked.valid & (claim.status == INFEASIBLE) & (claim.lower == np.inf) & (claim.upper == np.inf)
         lost &= (claim.s == 0).all((-1, -2)) & np.isfinite(claim.escape_rates).all(-1)
+        # Nothing is said beside what is claimed.
+        lost &= (claim.load_twist == 0).all(-1)
+        level = np.where((claim.escape_twist == 0).all(-1), level, 0)
         out, off = prove_separation(
             asked, posed.wrench, claim.escape_twist, claim.escape_rates, NEARBY * eps, lost
         )
         level, distance = np.where(lost, out, level), np.where(lost, off, shown.distance)
-        nothing = np.isnan(claim.lower) & np.isnan(claim.upper)
+        nothing = np.isnan(claim.lower) & np.isnan(claim.upper) & np.isnan(claim.s).all((-1, -2))
+        nothing &= np.isnan(claim.load_twist).all(-1) & np.isnan(claim.escape_twist).all(-1)
         level = np.where(~asked.valid & (claim.status == INVALID) & nothing, 2, level)
         unit = posed.cost_unit
-        known = (level > 0) & ~lost
-        lower = np.where(known, shown.lower * unit, np.where(level > 0, np.inf, np.nan))
-        upper = np.where(known, shown.upper * unit, np.where(level > 0, np.inf, np.nan))
+        known = (level > 0) & ~lost & asked.valid
+        rest = np.where((level > 0) & lost, np.inf, np.nan)
+        lower, upper = (np.where(known, x * unit, rest) for x in (shown.lower, shown.upper))
     distance = np.where(level == 2, 0.0, np.where(level == 1, distance, np.inf))
     moved = np.where(known & (claim.status == OPTIMAL), shown.moved, 0.0)
     return Proof(*(x.reshape(posed.shape) for x in (LEVELS[level], distance, lower, upper, moved)))
@@ -110,7 +114,7 @@ def _claim(posed: ForceProblem, answer) -> Claim:
     back = np.where(posed.cost_unit == posed.unit, 1.0, posed.unit)[:, None]
     length = asked.known.length
     return Claim(
-        said.numbers("status"),
+        said.integers("status"),
         scaled_force(force, asked.known.scale, asked.known.normal_index),
         _in_units(said.numbers("upper"), posed.cost_unit),
         _in_units(said.numbers("lower"), posed.cost_unit),
@@ -142,7 +146,7 @@ def _held(
         # A lower end alone must not gain by forces that are far too large.
         near = np.abs(shown.lower) if asked.weight is None else np.abs(shown.lower) + asked.weight
         alone = np.minimum(room, max(fine, ENDS * EPS) * near)
-        dear = claim.lower <= shown.lower + np.where(cheap, room, alone)
+        dear = claim.lower <= shown.lower + np.where(cheap & (claim.status == OPTIMAL), room, alone)
         width = np.maximum(claim.upper, shown.upper) - np.minimum(claim.lower, shown.lower)
         optimal = (claim.status == OPTIMAL) & cheap & dear & (width <= allowed)
         stalled = (claim.status == STALLED) & (dear | (claim.lower == -np.inf))
@@ -192,7 +196,7 @@ def _admissible(asked: Asked, s: np.ndarray, fine: float) -> np.ndarray:
     applied = np.einsum("lij,lj->li", asked.known.A, s.reshape(len(s), -1))
     size = np.linalg.norm(asked.known.A, axis=(-2, -1)) * total + np.linalg.norm(asked.load, axis=-1)
     rooms, edge = edges_of(asked, s), fine * total[:, None]
-    reach = np.linalg.norm(asked.scaled_jacobian(), axis=(1, 2)) * total[:, None]
+    reach = np.linalg.norm(asked.reach(), axis=1) * total[:, None]
     return (
         np.isfinite(total + size)
         & (np.linalg.norm(applied + asked.load, axis=-1) <= fine * size)
@@ -243,7 +247,7 @@ def _missing_load(asked: Asked, s: np.ndarray) -> np.ndarray:
 def _missing_torque(asked: Asked, s: np.ndarray) -> np.ndarray:
     """By what share tau_max and J would have to be better."""
     over = np.maximum(-edges_of(asked, s).torque, 0.0)
-    size = np.einsum("lknj,lkn->lj", np.abs(asked.scaled_jacobian()), np.abs(s))
+    size = np.einsum("lkj,lk->lj", asked.reach(), np.linalg.norm(s, axis=-1))
     size = size + np.where(np.isfinite(asked.torque), asked.torque, 0.0)
     return np.max(over / np.where(size > 0, size, 1.0), -1, initial=0.0)
 
@@ -257,7 +261,7 @@ def _proved_bound(asked: Asked, claim: Claim, s: np.ndarray) -> np.ndarray:
     k, n, joints = jacobian.shape[1:]
     x = np.einsum("lkij,li->lkj", known.blocks, y) + np.einsum("lkcj,lj->lkc", jacobian, rates)
     blur = np.linalg.norm(known.blocks, axis=(-2, -1)) * np.linalg.norm(y, axis=-1)[:, None]
-    blur = blur + np.linalg.norm(jacobian, axis=(-2, -1)) * np.linalg.norm(rates, axis=-1)[:, None]
+    blur = blur + np.linalg.norm(asked.reach(), axis=-1) * np.linalg.norm(rates, axis=-1)[:, None]
     x[..., 0] -= (24 + n + joints) * EPS * blur
     best = lower_bound(asked, Multipliers(y, rates, x), s)
     work = np.linalg.norm(y, axis=-1) * np.linalg.norm(asked.load, axis=-1) + asked.joint_work(rates)

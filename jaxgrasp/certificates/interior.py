@@ -113,7 +113,7 @@ def _needs(asked: Asked, s: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, 
     size = np.linalg.norm(s, axis=-1)
     cone = np.sqrt(2.0) * shift[:, None] + 8 * EPS * size
     cap = shift[:, None] + 2 * EPS * (size + np.where(np.isfinite(asked.cap), asked.cap, 0.0))
-    reach = np.linalg.norm(asked.scaled_jacobian(), axis=(1, 2))
+    reach = np.linalg.norm(asked.reach(), axis=1)
     total = np.linalg.norm(size, axis=-1)[:, None]
     terms = s.shape[1] * s.shape[2] + 20
     torque = reach * (shift[:, None] + terms * EPS * total)

@@ -27,6 +27,12 @@ class Fields:
             raise Malformed(name)
         return array.astype(np.float64).reshape(math.prod(self.batch), *own)
 
+    def integers(self, name: str) -> np.ndarray:
+        """(N,) float64, of whole numbers alone."""
+        if self.array(name).dtype.kind not in "iu":
+            raise Malformed(name)
+        return self.numbers(name)
+
     def array(self, name: str) -> np.ndarray:
         """The field as it stands; Malformed where it is no array."""
         try:

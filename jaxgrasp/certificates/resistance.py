@@ -31,6 +31,7 @@ __all__ = ["claim_of", "of_size_one", "prove_resistance"]
 
 RESISTANT, NOT_RESISTANT, MARGINAL, UNDECIDED, INVALID = 1, 2, 3, 4, 5
 NEARBY = 64.0  # eps: how far numbers may lie of which a proof to rounding speaks
+FINE = 256.0  # eps: rounding that the balance of an internal force may show
 LARGEST_CLAIM = 1e-3  # a bracket this wide is not marginal
 LANES = 2048  # at once: what fits a cache
 
@@ -66,8 +67,8 @@ def claim_of(grasp, answer, known: Rebuilt) -> Claim:
     batch, k, n = grasp.position.shape[:-2], *known.scale.shape[1:]
     m, said = 3 if grasp.position.shape[-1] == 2 else 6, Fields(answer, batch)
     return Claim(
-        status=said.numbers("status"),
-        rank=said.numbers("rank"),
+        status=said.integers("status"),
+        rank=said.integers("rank"),
         lower=said.numbers("lower"),
         upper=said.numbers("upper"),
         s=said.numbers("internal_force", k * n).reshape(-1, k, n),
@@ -132,6 +133,7 @@ def _proved(
     fits = numeric_rank_fits(known.A, claim.rank, facts.sigma, eps)
     marginal = _marginal(claim, tolerance, eps)
     sound = known.valid & fits & (claim.lower <= claim.upper) & np.isin(claim.status, (1, 2, 3, 4))
+    sound &= _silent(known, raw) & _balances(known.A, claim, eps)
     full = claim.rank == known.A.shape[1]
     sound &= np.select([claim.status == RESISTANT, claim.status == MARGINAL], [full, full & marginal], True)
     verdict = np.select(
@@ -156,8 +158,22 @@ def _proved(
         ends = float(claim.lower[i]), float(claim.upper[i])
         level[i], distance[i] = _exactly(lane, int(claim.status[i]), ends, not full[i], proved)
     nothing = np.isnan(claim.lower) & np.isnan(claim.upper) & (claim.rank == -1)
+    nothing &= np.isnan(raw.s).all((-1, -2)) & np.isnan(np.concatenate([raw.escape, raw.bound], -1)).all(-1)
     level[~known.valid & (claim.status == INVALID) & nothing] = 2
     return level, distance
+
+
+def _silent(known: Rebuilt, raw: Claim) -> np.ndarray:
+    """Contacts that do not count press nothing, and a grasp that holds names no twist."""
+    absent = np.where(known.live[..., None], 0.0, raw.s)
+    return (absent == 0).all((-1, -2)) & ((raw.escape == 0).all(-1) | (raw.status != RESISTANT))
+
+
+def _balances(A: np.ndarray, claim: Claim, eps: float) -> np.ndarray:
+    """The internal force given balances to rounding, where it has to prove anything; |s| = 1."""
+    applied = np.linalg.norm(np.einsum("lij,lj->li", A, claim.s.reshape(len(A), -1)), axis=-1)
+    idle = (claim.status != RESISTANT) & (claim.lower == -np.inf)
+    return idle | (applied <= FINE * eps * np.linalg.norm(A, axis=(-2, -1)))
 
 
 def _facts(known: Rebuilt, claim: Claim) -> Facts:

@@ -35,8 +35,12 @@ def prove_separation(
     twist, rates = twist / largest, rates / largest
     shown = _separates(asked, twist, rates)
     level, distance = np.where(lanes & shown, 2, 0), np.zeros(len(lanes))
+    # The twist alone: joints that turn beside it would say something else.
+    turning = np.linalg.norm(asked.reach(), axis=(1, 2)) * np.linalg.norm(rates, axis=-1)
+    moving = np.linalg.norm(asked.known.A, axis=(-2, -1)) * np.linalg.norm(twist, axis=-1)
     twist = twist / np.max(np.abs(twist), -1, keepdims=True)
-    for lane in np.flatnonzero(lanes & ~shown & np.isfinite(twist).all(-1)):
+    lanes = lanes & ~shown & (turning <= 64 * nearby * moving) & np.isfinite(twist).all(-1)
+    for lane in np.flatnonzero(lanes):
         level[lane], distance[lane] = _in_integers(asked, wrench[lane], twist[lane], int(lane), nearby)
     return level, distance
 
@@ -48,7 +52,7 @@ def _separates(asked: Asked, twist: np.ndarray, rates: np.ndarray) -> np.ndarray
     x = np.einsum("lkij,li->lkj", known.blocks, twist) + np.einsum("lkcj,lj->lkc", jacobian, rates)
     speed, size = np.linalg.norm(twist, axis=-1), np.linalg.norm(asked.load, axis=-1)
     blur = np.linalg.norm(known.blocks, axis=(-2, -1)) * speed[:, None]
-    blur = blur + np.linalg.norm(jacobian, axis=(-2, -1)) * np.linalg.norm(rates, axis=-1)[:, None]
+    blur = blur + np.linalg.norm(asked.reach(), axis=-1) * np.linalg.norm(rates, axis=-1)[:, None]
     blur = (24 + n + joints) * EPS * blur
     violation = np.linalg.norm(x[..., 1:], axis=-1) - x[..., 0] + blur
     most = np.minimum(asked.cap, LIMIT * size[:, None])
