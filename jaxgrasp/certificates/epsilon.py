@@ -17,7 +17,8 @@ import numpy as np
 
 from .dyadic import exact_grasp
 from .exact_force import scaled_lane
-from .exact_twist import escape_twist, rounding_distance
+from .exact_twist import escape_twist
+from .nearby import rounding_distance
 from .polytope import ball_inside
 from .proof import LEVELS, Proof
 from .reading import Fields, Malformed
@@ -188,5 +189,6 @@ class _Lane:
         xi, scaled = -self.claim.direction[lane] * self.row_scale, scaled_lane(known, lane, self.dimension)
         if escape_twist(grasp, scaled, xi) is not None:
             return 2, 0.0
-        distance, _ = rounding_distance(grasp, scaled, xi, known.friction[lane][live])
-        return (1, distance) if distance <= NEARBY * self.eps else (0, np.inf)
+        nearby = NEARBY * self.eps
+        distance, _ = rounding_distance(grasp, scaled, xi, known.friction[lane][live], nearby)
+        return (1, distance) if distance <= nearby else (0, np.inf)

@@ -10,7 +10,8 @@ from .dyadic import ForceSet, Twist, exact_grasp, twist_of
 from .elimination import independent
 from .enclosures import DIGITS
 from .exact_force import internal_force, margin_at_least, scaled_lane
-from .exact_twist import escape_twist, margin_at_most, moves_all_alike, rounding_distance
+from .exact_twist import escape_twist, margin_at_most, moves_all_alike
+from .nearby import rounding_distance
 from .rebuilt import EPS, Rebuilt
 
 __all__ = ["ExactLane"]
@@ -71,7 +72,7 @@ class ExactLane:
         """How far the numbers lie, at most, for which a twist next to the given one escapes, and that twist."""
         if not np.isfinite(self.twist).all():
             return np.inf, None
-        return rounding_distance(self.grasp, self.scaled, self.twist, self.friction)
+        return rounding_distance(self.grasp, self.scaled, self.twist, self.friction, self.nearby)
 
     @property
     def distance(self) -> float:
@@ -94,10 +95,14 @@ class ExactLane:
         )
 
     def at_least_nearby(self, lower: float) -> float:
-        """How far a map lies, relatively, that has the internal force s itself, if s shows ``lower``; else infinite."""
+        """How far a map lies, relatively, that has an internal force next to s which shows ``lower``; else infinite."""
         s, A = self.s, self.scaled.A
+        if not np.isfinite(s).all():
+            return np.inf
+        # Balanced along all but the directions that rounding makes.
+        s = s - (np.linalg.pinv(A, rcond=self.nearby) @ (A @ s.ravel())).reshape(s.shape)
         tails, total = np.linalg.norm(s[:, 1:], axis=-1), float(s[:, 0].sum())
-        if not (np.isfinite(s).all() and total > 0):
+        if not total > 0:
             return np.inf
         shown = len(s) * float(np.min(s[:, 0] - tails)) / total
         residual = float(np.linalg.norm(A @ s.ravel()) / np.linalg.norm(A)) + A.shape[1] * EPS

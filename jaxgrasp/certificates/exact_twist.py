@@ -1,6 +1,4 @@
-"""An escape twist in exact arithmetic, next to one in floating point; the upper bound a twist shows; and how near the
-numbers lie that a twist proves to rounding only.
-"""
+"""An escape twist in exact arithmetic, next to one in floating point; and the upper bound that a twist shows."""
 
 from __future__ import annotations
 
@@ -13,9 +11,8 @@ from .dyadic import ExactGrasp, Twist, dot, twist_of
 from .elimination import null_vector, solve
 from .enclosures import root_above, root_below
 from .exact_force import Scaled
-from .rebuilt import EPS
 
-__all__ = ["escape_twist", "margin_at_most", "moves_all_alike", "rounding_distance", "without_pitch"]
+__all__ = ["escape_twist", "margin_at_most", "moves_all_alike", "physical"]
 
 UNSEEN = 1e-9  # of its size: a contact that a twist moves by less may not move at all
 EDGE = 1e-6  # of its size: a contact this near the edge of its cone is pushed inwards
@@ -28,7 +25,7 @@ def escape_twist(grasp: ExactGrasp, lane: Scaled, xi: np.ndarray) -> Twist | Non
     Three attempts: as it is; at rest exactly at the contacts it hardly moves; a little further inside the cones. None
     where a contact clearly opposes xi: a twist far from it is no proof of what was said.
     """
-    direct = twist_of(grasp, _physical(lane, grasp.dimension, xi))
+    direct = twist_of(grasp, physical(lane, grasp.dimension, xi))
     if grasp.escapes(direct):
         return direct
     x = _velocities(lane, xi)
@@ -42,13 +39,13 @@ def escape_twist(grasp: ExactGrasp, lane: Scaled, xi: np.ndarray) -> Twist | Non
             return still
     inwards = _inwards(lane, x, unseen, size)
     for step in STEPS if np.isfinite(inwards).all() else ():
-        nudged = twist_of(grasp, _physical(lane, grasp.dimension, xi + step * inwards))
+        nudged = twist_of(grasp, physical(lane, grasp.dimension, xi + step * inwards))
         if grasp.escapes(nudged):
             return nudged
     return None
 
 
-def _physical(lane: Scaled, dimension: int, xi: np.ndarray) -> np.ndarray:
+def physical(lane: Scaled, dimension: int, xi: np.ndarray) -> np.ndarray:
     """(velocity / length; angular velocity): the units of the positions."""
     return np.concatenate([xi[:dimension] * lane.length, xi[dimension:]])
 
@@ -141,83 +138,3 @@ def moves_all_alike(grasp: ExactGrasp) -> bool:
     scale = math.lcm(*(x.denominator for x in right))
     rows = list(zip(*columns, strict=True))
     return solve(rows, [int(x * scale) for x in right]) is not None
-
-
-def rounding_distance(
-    grasp: ExactGrasp, lane: Scaled, xi: np.ndarray, friction: np.ndarray
-) -> tuple[float, Twist]:
-    """How far, at most, the numbers lie for which a twist escapes exactly, and that twist; infinite: none found.
-
-    Positions over the length, angles of the normals, mu, gamma over the length; the largest of all. The twist is taken
-    as it stands, and freed of its translation along its own axis, so that a contact can be moved to where it does not
-    notice it; the share of that translation counts as distance, too: another motion is no proof of this one.
-    """
-    direct = twist_of(grasp, _physical(lane, grasp.dimension, xi))
-    turned = without_pitch(grasp, lane, xi)
-    if not (any(turned.velocity) or any(turned.rotation)):
-        return np.inf, turned
-    ways = (0.0, direct), (_pitch(grasp.dimension, xi), turned)
-    found = [(_farthest(grasp, lane, twist, friction, least), twist) for least, twist in ways]
-    return min(found, key=lambda x: x[0])
-
-
-def _farthest(grasp: ExactGrasp, lane: Scaled, twist: Twist, friction: np.ndarray, least: float) -> float:
-    """The distance of the contact that has to change most; at least ``least``."""
-    opposed = (i for i in grasp.contacts if grasp.opposes(i, twist))
-    return max([least, *(_contact_distance(grasp, lane, twist, i, float(friction[i])) for i in opposed)])
-
-
-def _pitch(dimension: int, xi: np.ndarray) -> float:
-    """The share of the twist's translation along its own axis, less what the rounding of its numbers makes of it."""
-    turn = xi[dimension:]
-    if dimension == 2 or not turn.any():
-        return 0.0
-    axis = turn / np.max(np.abs(turn))  # its square may underflow
-    along = abs(float(xi[:3] @ axis)) / float(np.linalg.norm(axis))
-    return max(along / float(np.linalg.norm(xi)) - 8 * EPS, 0.0)
-
-
-def without_pitch(grasp: ExactGrasp, lane: Scaled, xi: np.ndarray) -> Twist:
-    """The twist freed of its translation along its own axis, ``v . omega = 0`` exactly, times a positive number."""
-    twist = twist_of(grasp, _physical(lane, grasp.dimension, xi))
-    square, pitch = dot(twist.rotation, twist.rotation), dot(twist.velocity, twist.rotation)
-    if not square:
-        return twist
-    velocity = [square * v - pitch * w for v, w in zip(twist.velocity, twist.rotation, strict=True)]
-    return Twist(velocity, [square * w for w in twist.rotation])
-
-
-def _root(value: Fraction) -> float:
-    """The square root, rounded up."""
-    root = root_above(value, 20)
-    return float(root) * (1 + 1e-15) if root < 2**1000 else np.inf
-
-
-def _contact_distance(grasp: ExactGrasp, lane: Scaled, twist: Twist, i: int, mu: float) -> float:
-    """What it takes to make contact i blind to the twist, or to lower its friction until it gives way."""
-    length = Fraction(lane.length) / Fraction(2) ** grasp.length_exponent
-    u, turn = grasp.velocity(i, twist), twist.rotation
-    speed, spin = dot(u, u), dot(turn, turn)
-    n, nn = grasp.normal[i], grasp.normal_square[i]
-    h, about = dot(u, n), dot(turn, n)
-    gamma = float(Fraction(grasp.torsion[i]) / length)
-    # The torsion goes by turning the normal across the axis, or by giving up gamma.
-    twisting = 0.0
-    if grasp.torsion[i] and about:
-        twisting = min(_root(Fraction(about * about, spin * nn)) * 1.6, gamma)
-    ways = []
-    if spin and not dot(twist.velocity, turn):  # the contact moves onto the axis
-        ways.append(max(_root(Fraction(speed) / (spin * length * length)), twisting))
-    if twisting == 0.0 or twisting == gamma:
-        if speed and h < 0:  # the normal turns until the contact slides, without friction
-            ways.append(max(_root(Fraction(h * h, speed * nn)) * 1.6, mu, gamma))
-        elif h >= 0:
-            sliding = Fraction(speed * nn - h * h, nn)
-            if sliding > 0:
-                limit = float(min(root_below(Fraction(h * h, nn) / sliding, 20), Fraction(2) ** 1000))
-                ways.append(max(mu - limit * (1 - 1e-15), gamma))
-    area = speed * spin - dot(u, turn) ** 2
-    if area and twisting > 0.0:  # the normal turns until the contact slides and does not twist: torsion stays
-        off = h * h * spin + about * about * speed - 2 * h * about * dot(u, turn)
-        ways.append(max(_root(Fraction(off, nn * area)) * 1.6, mu))
-    return min(ways, default=np.inf)

@@ -15,7 +15,8 @@ import numpy as np
 from .criteria import Asked
 from .dyadic import ExactGrasp, Twist, exact_grasp, integers
 from .exact_force import scaled_lane
-from .exact_twist import escape_twist, rounding_distance
+from .exact_twist import escape_twist
+from .nearby import rounding_distance
 from .rebuilt import EPS
 
 __all__ = ["prove_separation"]
@@ -79,7 +80,7 @@ def _in_integers(
     clear = float(twist @ asked.load[lane]) > 64 * nearby * float(
         np.linalg.norm(twist) * np.linalg.norm(asked.load[lane])
     )
-    distance, _ = rounding_distance(grasp, scaled, twist, known.friction[lane][live])
+    distance, _ = rounding_distance(grasp, scaled, twist, known.friction[lane][live], nearby)
     return (1, distance) if clear and distance <= nearby else (0, np.inf)
 
 
