@@ -21,6 +21,9 @@ from .rank import Rank, unnoticed
 __all__ = ["Verdict", "judge"]
 
 
+BALANCED = 128  # units of rounding, of |A| |s|: half of what the checker takes for an internal force
+
+
 class Verdict(NamedTuple):
     """The answer of each lane, in the units of the caller; lanes on the last axis."""
 
@@ -152,6 +155,7 @@ def _primal_evidence(tile: Tile, rank: Rank, full_rank: Array, u: Cone) -> Prima
     drift = distance / jnp.sqrt(folded.count)
     near = 2 * (distance + jnp.abs(slack) * drift)
     meant = jnp.abs(cone_sum(s[0]) - folded.count) < 0.5  # not so where s had no mean to be scaled by
+    meant = meant & (residual <= BALANCED * eps * folded.norm * size)
     near = jnp.where(known & meant & (drift < 0.5), near, jnp.inf * one)
     return Primal(s, slack, near, full_rank & known & (shift < slack))
 
@@ -184,6 +188,7 @@ def _bracket(primal: Primal, dual: Dual) -> Bracket:
     eps = unit_roundoff(primal.slack.dtype)
     blur = 16 * eps * (1 + jnp.abs(primal.slack) + jnp.abs(dual.upper))
     lower, upper = primal.slack - blur - primal.near, dual.upper + blur
+    lower = jnp.where(lower < -1 / (64 * eps), -jnp.inf, lower)  # forces so far beyond their mean show nothing
     return Bracket(jnp.minimum(lower, upper), upper, blur)  # rounding must not turn the bracket round
 
 
