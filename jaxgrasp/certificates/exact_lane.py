@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 
 import numpy as np
@@ -105,7 +106,8 @@ class ExactLane:
         if not total > 0:
             return np.inf
         shown = len(s) * float(np.min(s[:, 0] - tails)) / total
-        residual = float(np.linalg.norm(A @ s.ravel()) / np.linalg.norm(A)) + A.shape[1] * EPS
+        left = [math.fsum(row * s.ravel()) for row in A]
+        residual = float(np.linalg.norm(left) / np.linalg.norm(A)) + 2 * EPS
         return residual if shown >= lower - self.nearby else np.inf
 
     def at_most_nearby(self, upper: float) -> float:
