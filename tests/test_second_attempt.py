@@ -149,3 +149,30 @@ def test_jit_vmap_and_eager_agree():
         np.testing.assert_array_equal(eager.status, other.status)
         np.testing.assert_allclose(eager.lower, other.lower, rtol=1e-9, atol=1e-9)
     assert (np.asarray(eager.status) == Status.UNDECIDED).sum() <= 1
+
+
+@pytest.mark.parametrize("model", ["frictionless", "hard"])
+def test_contacts_that_nearly_coincide(model):
+    """Rank and margin turn on the last bits: whatever is said is proved."""
+    rng = np.random.default_rng(12)
+    angle = rng.uniform(0, 2 * np.pi, (1500, 4))
+    position = 10.0 ** rng.uniform(-6, 6, (1500, 1, 1)) * np.stack([np.cos(angle), np.sin(angle)], -1)
+    normal = -position / np.linalg.norm(position, axis=-1, keepdims=True)
+    apart = 10.0 ** rng.uniform(-16, -12, (1500, 1))
+    size = np.linalg.norm(position[:, 0], axis=-1, keepdims=True)
+    position[:, 1] = position[:, 0] + apart * size * rng.normal(size=(1500, 2))
+    normal[:, 1] = normal[:, 0] + apart * rng.normal(size=(1500, 2))
+    friction = 0.0 if model == "frictionless" else rng.choice([0.0, 1e-5, 0.5], (1500, 4))
+    grasp = jg.Grasp(position, normal, jg.HardFinger(friction))
+    answer = jg.wrench_resistance(grasp)
+    assert len(np.unique(answer.status)) > 1
+    assert np.all(jg.check(grasp, answer))
+
+
+def test_a_lost_rank_without_compiling():
+    """Operation by operation, also where lanes are picked for their singular values."""
+    position = np.array([[-1.0, 0.0], [1.0, 0.0]])
+    grasp = jg.Grasp(position, -position, jg.HardFinger(0.0))
+    with jax.disable_jit():
+        answer = jg.wrench_resistance(grasp)
+    assert int(answer.status) == Status.NOT_RESISTANT and int(answer.rank) == 1

@@ -125,7 +125,7 @@ def map_selected(kernel: Callable[[Any], Any], selected: Array, rows: Any, out: 
     def one_tile(carry: tuple[Array, Rows]) -> tuple[Array, Rows]:
         tile_number, current = carry
         chosen = lax.dynamic_slice(index, (tile_number * jnp.int32(width),), (width,))
-        tile = jax.tree.map(lambda x: x.at[chosen].get(mode="clip"), rows)
+        tile = jax.tree.map(lambda x: jnp.take(x, chosen, axis=0, mode="clip"), rows)
         result = kernel(tile)
         updated = jax.tree.map(lambda x, r: x.at[chosen].set(r, mode="drop"), current, result)
         return tile_number + jnp.int32(1), updated
@@ -203,7 +203,7 @@ def in_sweeps(sweeps: Sweeps, rows: Any, aside: Any, like: Any, count: Array, wi
         def one_tile(carry: tuple[Array, Any]) -> tuple[Array, Any]:
             tile, current = carry
             chosen = lax.dynamic_slice(index, (tile * jnp.int32(width),), (width,))
-            here = jax.tree.map(lambda x: x.at[chosen].get(mode="clip"), (source, aside, current))
+            here = jax.tree.map(lambda x: jnp.take(x, chosen, axis=0, mode="clip"), (source, aside, current))
             result = step(*here, number)
             updated = jax.tree.map(lambda x, r: x.at[chosen].set(r, mode="drop"), current, result)
             return tile + jnp.int32(1), updated

@@ -67,6 +67,12 @@ def _parameter(
     return None if value is None else _spread(value, (), batch, shape, f"the criterion's {name}")
 
 
+def _caps(max_normal: Any, k: int, batch: tuple[int, ...], shape: tuple[int, ...]) -> np.ndarray:
+    """(N, k), infinite where there are none."""
+    value = np.asarray(np.inf if max_normal is None else max_normal, np.float64)
+    return _spread(np.broadcast_to(value, (*value.shape[:-1], k)), (k,), batch, shape, "max_normal")
+
+
 def _in_contact_axes(grasp, torque_limits) -> tuple[Any, Any, Any]:
     """(J, |J|, tau_max) for forces in contact axes; J in body or world axes is turned here, ``J_contact = B^T J``.
 
@@ -127,11 +133,8 @@ def force_problem(grasp, problem) -> ForceProblem:
     live, n = known.live, len(known.components)
     valid = known.valid & np.isfinite(wrench).all(-1)
 
-    cap = np.full(live.shape, np.inf)
-    if problem.max_normal is not None:
-        value = np.asarray(problem.max_normal, np.float64)
-        cap = _spread(np.broadcast_to(value, (*value.shape[:-1], k)), (k,), batch, shape, "max_normal")
-        valid &= ((cap > 0) | ~live).all(-1)
+    cap = _caps(problem.max_normal, k, batch, shape)
+    valid &= ((cap > 0) | ~live).all(-1)
     jacobian, torque = np.zeros((len(live), k, n, 0)), np.zeros((len(live), 0))
     turned = jacobian
     if problem.torque_limits is not None:

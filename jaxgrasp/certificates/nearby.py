@@ -18,6 +18,7 @@ from .rebuilt import EPS
 
 __all__ = ["rounding_distance"]
 
+CHANGE = 1e-6  # of the twist
 STILL = 1e-9  # a contact that a twist moves by less, over its size, is meant to be at rest
 
 
@@ -57,7 +58,10 @@ def _settled(lane: Scaled, xi: np.ndarray, nearby: float) -> np.ndarray:
     _, values, V = np.linalg.svd(unit[still].reshape(-1, len(xi)))
     values = np.pad(values, (0, len(xi) - len(values)))
     null = V[values <= max(nearby * values[0], values[-1])]
-    return null.T @ (null @ xi)
+    settled = null.T @ (null @ xi)
+    # Another motion is no proof of this one.
+    near = np.linalg.norm(settled - xi) <= max(CHANGE, 64 * nearby) * np.linalg.norm(xi)
+    return settled if near else xi
 
 
 def _farthest(grasp: ExactGrasp, lane: Scaled, twist: Twist, friction: np.ndarray, least: float) -> float:

@@ -61,6 +61,7 @@ from .tolerances import (
     size_limit,
     stationary_tolerance,
     unit_roundoff,
+    vanishing_friction,
     visibility_tolerance,
     widest_scaling,
 )
@@ -127,6 +128,7 @@ __all__ = [
     "turned",
     "uniform",
     "unit_roundoff",
+    "vanishing_friction",
     "visibility_tolerance",
     "widened",
     "widest_scaling",

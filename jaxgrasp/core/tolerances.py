@@ -25,6 +25,7 @@ __all__ = [
     "size_limit",
     "stationary_tolerance",
     "unit_roundoff",
+    "vanishing_friction",
     "visibility_tolerance",
     "widest_scaling",
 ]
@@ -57,12 +58,17 @@ def rank_tolerance(dtype) -> float:
 
 
 def perturbation_tolerance(dtype) -> float:
-    """What "holds only by rounding" may change: 12 eps in positions over L, normals, and twice that in mu, gamma / L.
+    """What "holds only by rounding" may change: 12 eps in positions over L and in normals.
 
     The checker allows 64 eps for each, and measures up to five times as much: it divides by the angular velocity, or by
     that of the contact, alone.
     """
     return 12 * unit_roundoff(dtype)
+
+
+def vanishing_friction(dtype) -> float:
+    """mu and gamma / L up to this, 64 eps, may be 0 by rounding: as much as the checker allows."""
+    return 64 * unit_roundoff(dtype)
 
 
 def pivot_tolerance(dtype) -> float:

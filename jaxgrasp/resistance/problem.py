@@ -40,7 +40,7 @@ from ..contacts import (
     stored_norm,
     to_twist,
 )
-from ..core import Array, perturbation_tolerance, unit_roundoff
+from ..core import Array, perturbation_tolerance, unit_roundoff, vanishing_friction
 
 __all__ = ["Start", "identity", "bound_of", "margin_program", "starting_point", "upper_bound"]
 
@@ -85,7 +85,7 @@ def _alike(columns: Cone, exists: Array, twist: Array) -> Array:
     off = exists * jnp.abs(x[0] - 1)
     for c, tail in zip(columns[1:], x[1:], strict=True):
         scale = jnp.sqrt(reduce(jnp.add, [row * row for row in entries(c)])[0])
-        gone = scale <= 2 * near
+        gone = scale <= vanishing_friction(dtype)
         off = jnp.maximum(
             off, jnp.where(gone, zero, jnp.abs(tail) / jnp.where(gone, jnp.ones_like(scale), scale))
         )

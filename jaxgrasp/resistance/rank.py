@@ -17,7 +17,7 @@ from jax import lax
 from ..backend import kernel, to_rows
 from ..conic import RowSVD, cone_max, cone_min, cone_sum, inner, rmatvec, row_svd
 from ..contacts import Component, Contacts, fold
-from ..core import Array, perturbation_tolerance, rank_tolerance
+from ..core import Array, perturbation_tolerance, rank_tolerance, vanishing_friction
 
 __all__ = ["Rank", "rank_kernel", "unnoticed"]
 
@@ -46,7 +46,7 @@ def _certain_contacts(contacts: Contacts, length: Array) -> Contacts:
     A twist that these contacts do not notice, rounded numbers of the grasp do not notice either: mu x_t = 0 for mu > 0
     means x_t = 0. However little friction there is, their singular values are those of the geometry.
     """
-    limit, L = 2 * perturbation_tolerance(length.dtype), length[:, None]
+    limit, L = vanishing_friction(length.dtype), length[:, None]
     one, zero = jnp.ones_like(contacts.friction), jnp.zeros_like(contacts.friction)
     return contacts._replace(
         friction=jnp.where(contacts.friction > limit, one, zero),

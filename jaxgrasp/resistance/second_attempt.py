@@ -358,7 +358,9 @@ def second_attempt(
     room = 256 * unit_roundoff("float64")
     lower = jnp.where(sound, slack - error - (room + 4 * eps) * jnp.abs(slack) - room, -jnp.inf)
     upper = upper + room + (room + 4 * eps) * jnp.abs(upper)
-    lower = jnp.where(lower < -1 / (64 * eps), -jnp.inf, jnp.minimum(lower, upper))
+    # Forces far beyond their mean show nothing, nor do those that contradict the twist by more than rounding.
+    crossed = lower > upper + 4 * (room + 4 * eps) * (1 + jnp.abs(upper))
+    lower = jnp.where((lower < -1 / (64 * eps)) | crossed, -jnp.inf, jnp.minimum(lower, upper))
     full = first.rank >= m
     status = first_of(
         [

@@ -188,7 +188,8 @@ def _bracket(primal: Primal, dual: Dual) -> Bracket:
     eps = unit_roundoff(primal.slack.dtype)
     blur = 16 * eps * (1 + jnp.abs(primal.slack) + jnp.abs(dual.upper))
     lower, upper = primal.slack - blur - primal.near, dual.upper + blur
-    lower = jnp.where(lower < -1 / (64 * eps), -jnp.inf, lower)  # forces so far beyond their mean show nothing
+    # Forces far beyond their mean show nothing, nor do those that contradict the twist by more than rounding.
+    lower = jnp.where((lower < -1 / (64 * eps)) | (lower > upper + 4 * blur), -jnp.inf, lower)
     return Bracket(jnp.minimum(lower, upper), upper, blur)  # rounding must not turn the bracket round
 
 
