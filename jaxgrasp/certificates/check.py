@@ -56,7 +56,8 @@ def prove(
     wrench, criterion, max_normal, torque_limits, smoothing
                    for forces: the problem, exactly as ``optimize_forces`` was asked; wrench and criterion are required.
                    What is proved is this problem, whatever the answer was made for
-    tolerance      for verdicts: the |t*| that MARGINAL may claim; by default what the answer's own bracket claims, as
+    tolerance      for verdicts: MARGINAL may claim |t*| up to twice this, and up to 9e-12 (4e-5 in float32) in any
+                   case; by default what the answer's own bracket claims, as
                    long as that is below 1e-3. For forces: the relative gap that OPTIMAL may leave, by default 1e-6
                    (2e-3 in float32), or what smoothing costs.
                    For epsilon: the rounding its bounds may show, by default 1e-9 of epsilon

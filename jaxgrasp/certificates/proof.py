@@ -29,7 +29,8 @@ class Proof:
     status         int32 (*batch), a ``Status``: PROVED_EXACTLY, PROVED_TO_ROUNDING or REFUSED
     distance       (*batch) PROVED_TO_ROUNDING: how far the numbers lie for which it is true, at most; 0 where exact,
                    infinite where refused. Of positions and gamma over the largest |p_i|, angles of normals in rad, mu
-                   without unit; for forces of the load, over its size
+                   without unit; for forces the share by which mu, gamma, caps, torques and J are better, and the load
+                   that is missing over the sizes of all forces and of the load
     lower, upper   (*batch) what is proved of the bracketed value (t*, the optimal cost, epsilon), rounded outwards;
                    NaN where refused. For OPTIMAL the optimum of the numbers the status speaks of
     force_distance (*batch) OPTIMAL: exact forces lie within this share of the largest of those given; else 0
