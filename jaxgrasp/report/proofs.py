@@ -23,15 +23,16 @@ def reprove_verdict(verdict: Verdict, metadata: dict[str, Any]) -> str:
     known = verdict.bound_twist is not None
     with precision(dtype.name):
         grasp = verdict.grasp(dtype)
-        nothing = np.zeros(verdict.active.size * len(verdict.components))
+        blank = np.nan if verdict.status == Status.INVALID else 0.0
+        nothing, still = np.full(verdict.active.size * len(verdict.components), blank), np.full(6, blank)
         evidence = SimpleNamespace(
             status=np.asarray(verdict.status.value),
             lower=np.asarray(verdict.margin),
             upper=np.asarray(verdict.upper if known else max(verdict.margin, 1.0)),  # t* <= 1 needs no proof
             rank=np.asarray(-1 if verdict.rank is None else verdict.rank),
             internal_force=nothing if verdict.force is None else verdict.force.ravel(),
-            escape_twist=np.zeros(6) if verdict.twist is None else verdict.twist,
-            bound_twist=verdict.bound_twist if known else np.zeros(6),
+            escape_twist=still if verdict.twist is None else verdict.twist,
+            bound_twist=verdict.bound_twist if known else still,
         )
         proof = prove_resistance(grasp, evidence, tolerance=metadata.get("tolerance", 1e-8))
     holds = proof.status != Status.REFUSED

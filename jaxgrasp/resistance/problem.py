@@ -40,12 +40,13 @@ from ..contacts import (
     stored_norm,
     to_twist,
 )
-from ..core import Array, perturbation_tolerance, unit_roundoff, vanishing_friction
+from ..core import Array, unit_roundoff, vanishing_friction
 
 __all__ = ["Start", "identity", "bound_of", "margin_program", "starting_point", "upper_bound"]
 
 
 START_DEPTH = 0.3  # how far inside the cones the first forces lie, relative to their tangential size
+ALIKE = 32  # units of rounding of the numbers: what may keep a twist from moving all contacts alike
 
 
 def identity(folded: Folded) -> Cone:
@@ -80,7 +81,7 @@ def _interior(exists: Array, s: Cone, lower: Array) -> Cone:
 def _alike(columns: Cone, exists: Array, twist: Array) -> Array:
     """Whether A^T twist is e for some numbers within rounding of the grasp's, and the twist no null vector of A."""
     dtype = twist.dtype
-    near, size = perturbation_tolerance(dtype), vector_norm(twist)
+    near, size = ALIKE * unit_roundoff(dtype), vector_norm(twist)
     x, zero = rmatvec(columns, twist), jnp.zeros_like(exists)
     off = exists * jnp.abs(x[0] - 1)
     for c, tail in zip(columns[1:], x[1:], strict=True):
