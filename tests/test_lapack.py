@@ -77,19 +77,28 @@ def grasps(dimension=2, k=3, count=2):
     return jg.Grasp(position, normal, jg.HardFinger(friction))
 
 
-LOAD, BODY = np.array([0.0, -1.0, 0.1]), random_bodies(np.random.default_rng(1), 2, 2)
-STATE = random_states(np.random.default_rng(2), 2, 2)
+LOAD = np.array([0.0, -1.0, 0.1])
+
+
+def body():
+    return random_bodies(np.random.default_rng(1), 2, 2)
+
+
+def state():
+    return random_states(np.random.default_rng(2), 2, 2)
+
+
 LIMITS = jg.TorqueLimits(np.eye(6)[:, :2], np.ones(2))
 
 
 def closed(grasp, controller):
     return jg.close_loop(
-        grasp, BODY, controller=controller, state=STATE, simulation=Simulation(2, timestep=0.002)
+        grasp, body(), controller=controller, state=state(), simulation=Simulation(2, timestep=0.002)
     )
 
 
 def regulated(grasp):
-    return closed(grasp, jg.regulator(grasp, BODY))
+    return closed(grasp, jg.regulator(grasp, body()))
 
 
 FREE = {
@@ -112,13 +121,13 @@ FREE = {
     "guaranteed_radius": jg.guaranteed_radius,
     "task_quality": lambda g: jg.task_quality(g, LOAD[None]),
     "isotropy and volume": lambda g: (grasp_isotropy(g), grasp_volume(g)),
-    "linearize": lambda g: jg.linearize(g, BODY),
-    "controllability": lambda g: jg.controllability(g, BODY),
-    "gramian": lambda g: gramian(*(getattr(jg.linearize(g, BODY), name) for name in "AB")),
-    "regulator": lambda g: jg.regulator(g, BODY),
+    "linearize": lambda g: jg.linearize(g, body()),
+    "controllability": lambda g: jg.controllability(g, body()),
+    "gramian": lambda g: gramian(*(getattr(jg.linearize(g, body()), name) for name in "AB")),
+    "regulator": lambda g: jg.regulator(g, body()),
     "closed loop, regulated": regulated,
     "closed loop, computed torque": lambda g: closed(g, jg.ComputedTorque(jg.Gains.of_rate(25.0))),
-    "a body's numbers": lambda g: (BODY.valid, BODY.inverse_inertia),
+    "a body's numbers": lambda g: (body().valid, body().inverse_inertia),
     "placement's floor": lambda g: EpsilonFloor().value(g, ()),
     "d radius": jax.grad(lambda g: jnp.sum(jg.guaranteed_radius(g).radius), allow_int=True),
     "d volume": jax.grad(lambda g: jnp.sum(grasp_volume(g)), allow_int=True),
