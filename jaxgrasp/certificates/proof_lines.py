@@ -125,6 +125,7 @@ def _twist(lane: ExactLane, d: int) -> dict[str, Any]:
     twist, found = lane.escape, {}
     if twist is None:
         _, twist = lane.nearest
+        assert twist is not None  # the lane is proved
         if lane.distance:
             found = {"proof": "to rounding", "within": lane.distance.hex()}
     e = lane.grasp.length_exponent
