@@ -11,7 +11,6 @@ Float32 lanes are the float64 ones, rounded; their brackets are compared with th
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import os
 import sys
@@ -25,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "tables")
 
 import jax
 import numpy as np
-from figures import write_figures
+from figures import parser_of_tables, write_table
 
 jax.config.update("jax_enable_x64", True)
 
@@ -188,11 +187,7 @@ def markdown(rows: dict[str, Tally]) -> str:
 
 def main() -> None:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--markdown", type=Path)
+    parser = parser_of_tables(__doc__)
     parser.add_argument("--count", type=int, default=1_000_000)
     parser.add_argument("--precisions", nargs="+", default=["float64", "float32"])
     parser.add_argument("--kinds", nargs="+", default=[*KINDS, *MORE])
@@ -208,15 +203,7 @@ def main() -> None:
         texts.append(f"{dtype}\n\n{markdown(rows)}")
         print(f"\n{texts[-1]}\n{time.perf_counter() - start:.0f} s\n", flush=True)
         figures[dtype] = {"rows": {k: v._asdict() for k, v in rows.items()}, "earnest": where}
-    if options.markdown:
-        options.markdown.write_text("\n\n".join(texts) + "\n")
-    options.markdown = None
-    machine = {
-        "jax": jax.__version__,
-        "python": sys.version.split()[0],
-        "device": jax.devices()[0].device_kind,
-    }
-    write_figures(options, machine, **figures)
+    write_table(options, "\n\n".join(texts), **figures)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ that a symmetry, or a load on an edge of the cones, makes special, and both from
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import os
 import sys
@@ -23,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "tables")
 
 import jax
 import numpy as np
-from figures import write_figures
+from figures import parser_of_tables, write_table
 
 jax.config.update("jax_enable_x64", True)
 
@@ -58,11 +57,7 @@ def measure(name: str, limits: bool, criterion: str, count: int, seed: int) -> t
 
 def main() -> None:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--markdown", type=Path)
+    parser = parser_of_tables(__doc__)
     parser.add_argument("--count", type=int, default=2000)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--models", nargs="+", default=list(force_problems.MODELS))
@@ -88,15 +83,7 @@ def main() -> None:
                     lines.append(f"| {title} | {rank} | {1e6 * seconds:.0f} | {text} |")
                     print(lines[-1], flush=True)
                 figures[title] = {"counts": total.tolist(), "columns": COLUMNS, "seconds": seconds}
-    if options.markdown:
-        options.markdown.write_text("\n".join(lines) + "\n")
-        options.markdown = None
-    machine = {
-        "jax": jax.__version__,
-        "python": sys.version.split()[0],
-        "device": jax.devices()[0].device_kind,
-    }
-    write_figures(options, machine, problems=figures)
+    write_table(options, "\n".join(lines), problems=figures)
 
 
 if __name__ == "__main__":

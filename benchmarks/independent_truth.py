@@ -10,17 +10,14 @@ A contradiction is a proved verdict of the other sign, or a proved end of a brac
 
 from __future__ import annotations
 
-import argparse
 import importlib
-import sys
 from collections import Counter
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 from adversarial import MODELS, draw  # it sets the paths and the precision
-from figures import write_figures
+from figures import parser_of_tables, write_table
 
 import jaxgrasp as jg
 from jaxgrasp import Status
@@ -80,12 +77,8 @@ def measure(model, width: int, kind: str, count: int, chunk: int) -> Counter:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of_tables(__doc__)
     parser.add_argument("--count", type=int, default=100)
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()
     rows = {}
     for model in MODELS:
@@ -103,14 +96,9 @@ def main() -> None:
         f"| {row} | {' | '.join(str(x) for x in found.values())} |"
         for row, found in (rows | {"all": total}).items()
     ]
-    text = "\n".join(lines) + "\n"
-    print(text)
-    if options.markdown:
-        options.markdown.write_text(text)
-    options.markdown = None
-    write_figures(
-        options, {"jax": jax.__version__, "python": sys.version.split()[0]}, rows=rows | {"all": total}
-    )
+    text = "\n".join(lines)
+    print(text + "\n")
+    write_table(options, text, rows=rows | {"all": total})
 
 
 if __name__ == "__main__":

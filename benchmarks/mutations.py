@@ -10,7 +10,6 @@ false is counted as still true or undecided.
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import os
 import sys
@@ -25,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "tables")
 
 import jax
 import numpy as np
-from figures import write_figures
+from figures import parser_of_tables, write_table
 
 jax.config.update("jax_enable_x64", True)
 
@@ -60,11 +59,7 @@ def kinds(seed: int, lanes: int) -> Iterator[tuple[str, Any]]:
 
 def main() -> None:
     """Attack, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--markdown", type=Path)
+    parser = parser_of_tables(__doc__)
     parser.add_argument("--false", type=int, default=2000)
     parser.add_argument("--lanes", type=int, default=40)
     parser.add_argument("--seconds", type=float, default=540.0, help="no new round of grasps after this long")
@@ -114,17 +109,8 @@ def main() -> None:
          *untouched, "", f"False answers accepted: {len(holes)}", "", *(f"- {h}" for h in holes[:200]), "", *lines]
     )  # fmt: skip
     print("\n".join(short + untouched + holes[:50]))
-    if options.markdown:
-        options.markdown.write_text(text + "\n")
-    options.markdown = None
     table = [{"kind": r, "field": f, "change": n, **c} for (r, f, n), c in rows.items()]
-    write_figures(
-        options,
-        {"jax": jax.__version__, "python": sys.version.split()[0]},
-        rows=table,
-        genuine=genuine,
-        holes=holes,
-    )
+    write_table(options, text, rows=table, genuine=genuine, holes=holes)
 
 
 if __name__ == "__main__":
