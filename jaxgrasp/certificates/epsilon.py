@@ -15,8 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .dyadic import exact_grasp
-from .exact_force import scaled_lane
+from .exact_force import exact_and_scaled
 from .exact_twist import escape_twist
 from .nearby import rounding_distance
 from .polytope import ball_inside
@@ -178,17 +177,10 @@ class _Lane:
 
     def _escapes(self) -> tuple[int, float]:
         """``direction`` as a twist that no contact can oppose, turned round."""
-        known, lane = self.known, self.lane
-        live = self.live
-        grasp = exact_grasp(
-            known.position[lane][live],
-            known.normal[lane][live],
-            known.friction[lane][live],
-            known.torsion[lane][live],
-        )
-        xi, scaled = -self.claim.direction[lane] * self.row_scale, scaled_lane(known, lane, self.dimension)
+        grasp, scaled = exact_and_scaled(self.known, self.lane, self.dimension)
+        xi = -self.claim.direction[self.lane] * self.row_scale
         if escape_twist(grasp, scaled, xi) is not None:
             return 2, 0.0
         nearby = NEARBY * self.eps
-        distance, _ = rounding_distance(grasp, scaled, xi, known.friction[lane][live], nearby)
+        distance, _ = rounding_distance(grasp, scaled, xi, nearby)
         return (1, distance) if distance <= nearby else (0, np.inf)

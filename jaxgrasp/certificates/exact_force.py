@@ -14,12 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .dyadic import ExactGrasp, ForceSet
+from .dyadic import ExactGrasp, ForceSet, exact_grasp
 from .elimination import solve
 from .enclosures import root_above, root_below
 from .rebuilt import Rebuilt
 
-__all__ = ["Scaled", "internal_force", "margin_at_least", "scaled_lane"]
+__all__ = ["Scaled", "exact_and_scaled", "internal_force", "margin_at_least"]
 
 LARGEST_CHANGE = 0.5  # of the forces
 BITS = 60  # of a force when it becomes an integer
@@ -35,12 +35,20 @@ class Scaled(NamedTuple):
 
     A: np.ndarray
     directions: np.ndarray
+    friction: np.ndarray
     torsion: np.ndarray
     kinds: str
     length: float
 
 
-def scaled_lane(known: Rebuilt, lane: int, dimension: int) -> Scaled:
+def exact_and_scaled(known: Rebuilt, lane: int, dimension: int) -> tuple[ExactGrasp, Scaled]:
+    """Lane ``lane`` of the grasps: in whole numbers, and in floating point."""
+    live = known.live[lane]
+    numbers = (known.position, known.normal, known.friction, known.torsion)
+    return exact_grasp(*(x[lane][live] for x in numbers)), _scaled_lane(known, lane, dimension)
+
+
+def _scaled_lane(known: Rebuilt, lane: int, dimension: int) -> Scaled:
     """Lane ``lane`` of the grasps."""
     live = known.live[lane]
     blocks = known.blocks[lane][live]
@@ -49,6 +57,7 @@ def scaled_lane(known: Rebuilt, lane: int, dimension: int) -> Scaled:
     return Scaled(
         np.moveaxis(blocks, 0, 1).reshape(m, k * n),
         np.swapaxes(blocks[:, :dimension], 1, 2),
+        known.friction[lane][live],
         known.torsion[lane][live] / known.length[lane],
         kinds,
         float(known.length[lane]),

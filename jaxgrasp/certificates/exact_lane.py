@@ -7,10 +7,10 @@ from functools import cached_property
 
 import numpy as np
 
-from .dyadic import ForceSet, Twist, exact_grasp, twist_of
+from .dyadic import ForceSet, Twist, twist_of
 from .elimination import independent
 from .enclosures import DIGITS
-from .exact_force import internal_force, margin_at_least, scaled_lane
+from .exact_force import exact_and_scaled, internal_force, margin_at_least
 from .exact_twist import escape_twist, margin_at_most, moves_all_alike
 from .nearby import rounding_distance
 from .rebuilt import EPS, Rebuilt
@@ -32,11 +32,8 @@ class ExactLane:
         given: tuple[np.ndarray, np.ndarray], nearby: float,
     ):  # fmt: skip
         live = known.live[lane]
-        self.friction = known.friction[lane][live]
-        self.grasp = exact_grasp(
-            known.position[lane][live], known.normal[lane][live], self.friction, known.torsion[lane][live]
-        )
-        self.scaled, self.s = scaled_lane(known, lane, dimension), s[live]
+        self.grasp, self.scaled = exact_and_scaled(known, lane, dimension)
+        self.s = s[live]
         self.twist, self.bound, self.given, self.nearby = escape, bound, given, nearby
 
     @cached_property
@@ -73,7 +70,7 @@ class ExactLane:
         """How far the numbers lie, at most, for which a twist next to the given one escapes, and that twist."""
         if not np.isfinite(self.twist).all():
             return np.inf, None
-        return rounding_distance(self.grasp, self.scaled, self.twist, self.friction, self.nearby)
+        return rounding_distance(self.grasp, self.scaled, self.twist, self.nearby)
 
     @property
     def distance(self) -> float:

@@ -193,13 +193,12 @@ def _of_forces(
 def _admissible(asked: Asked, s: np.ndarray, fine: float) -> np.ndarray:
     """The forces as given: ``A s + w = 0`` and inside all limits, to rounding."""
     total = np.linalg.norm(s.reshape(len(s), -1), axis=-1)
-    applied = np.einsum("lij,lj->li", asked.known.A, s.reshape(len(s), -1))
-    size = np.linalg.norm(asked.known.A, axis=(-2, -1)) * total + np.linalg.norm(asked.load, axis=-1)
+    missing, size = _balance(asked, s)
     rooms, edge = edges_of(asked, s), fine * total[:, None]
     reach = np.linalg.norm(asked.reach(), axis=1) * total[:, None]
     return (
         np.isfinite(total + size)
-        & (np.linalg.norm(applied + asked.load, axis=-1) <= fine * size)
+        & (missing <= fine * size)
         & (rooms.cone >= -edge).all(-1)
         & (rooms.cap >= -edge).all(-1)
         & (rooms.torque >= -fine * (reach + np.where(np.isfinite(asked.torque), asked.torque, 0.0))).all(-1)
@@ -227,7 +226,8 @@ def _pulled_in(
             )
             inside = np.concatenate([head[..., None], s[..., 1:] * shrink[..., None]], -1)
             used = np.where((head > asked.cap) | (reached > 0), better, 0.0).max(-1, initial=0.0)
-            distance = np.maximum(_missing_load(asked, inside), _missing_torque(asked, inside))
+            missing, size = _balance(asked, inside)
+            distance = np.maximum(missing / np.where(size > 0, size, 1.0), _missing_torque(asked, inside))
             distance = np.maximum(distance, used) + 2 * EPS
             closer = (distance < least) & (least > near)
             best = np.where(closer[:, None, None], inside, best)
@@ -235,13 +235,12 @@ def _pulled_in(
     return best, least
 
 
-def _missing_load(asked: Asked, s: np.ndarray) -> np.ndarray:
-    """What the forces leave of the load, over the size of its terms."""
+def _balance(asked: Asked, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) |A s + w|, what the forces leave of the load, and |A| |s| + |w|, the size of its terms."""
     flat = s.reshape(len(s), -1)
     applied = np.einsum("lij,lj->li", asked.known.A, flat) + asked.load
     size = np.linalg.norm(asked.known.A, axis=(-2, -1)) * np.linalg.norm(flat, axis=-1)
-    size = size + np.linalg.norm(asked.load, axis=-1)
-    return np.linalg.norm(applied, axis=-1) / np.where(size > 0, size, 1.0)
+    return np.linalg.norm(applied, axis=-1), size + np.linalg.norm(asked.load, axis=-1)
 
 
 def _missing_torque(asked: Asked, s: np.ndarray) -> np.ndarray:

@@ -22,9 +22,7 @@ CHANGE = 1e-6  # of the twist
 STILL = 1e-9  # a contact that a twist moves by less, over its size, is meant to be at rest
 
 
-def rounding_distance(
-    grasp: ExactGrasp, lane: Scaled, xi: np.ndarray, friction: np.ndarray, nearby: float
-) -> tuple[float, Twist]:
+def rounding_distance(grasp: ExactGrasp, lane: Scaled, xi: np.ndarray, nearby: float) -> tuple[float, Twist]:
     """How far, at most, the numbers lie for which a twist escapes exactly, and that twist; infinite: none found.
 
     nearby  what is looked for: no better way is sought once one is found
@@ -33,41 +31,45 @@ def rounding_distance(
     contact can be moved to where it does not notice it; the share of that translation counts as distance, too: another
     motion is no proof of this one. Then the same of the twist next to it that the contacts at rest notice least.
     """
-    best = np.inf, twist_of(grasp, physical(lane, grasp.dimension, xi))
-    for settled in (xi, _settled(lane, xi, nearby)):
-        direct = twist_of(grasp, physical(lane, grasp.dimension, settled))
-        turned = without_pitch(grasp, lane, settled)
-        for least, twist in ((0.0, direct), (_pitch(grasp.dimension, settled), turned)):
-            if any(twist.velocity) or any(twist.rotation):
-                found = _farthest(grasp, lane, twist, friction, least)
-                best = min(best, (found, twist), key=lambda x: x[0])
-        if best[0] <= nearby:
-            break
+    found = _as_it_stands(grasp, lane, xi)
+    if found[0] <= nearby:
+        return found
+    settled = _settled(lane, xi, nearby)
+    return found if settled is None else min(found, _as_it_stands(grasp, lane, settled), key=lambda x: x[0])
+
+
+def _as_it_stands(grasp: ExactGrasp, lane: Scaled, xi: np.ndarray) -> tuple[float, Twist]:
+    """The better of the twist itself and the one without its pitch, and how far the numbers lie."""
+    direct = twist_of(grasp, physical(lane, grasp.dimension, xi))
+    best = np.inf, direct
+    for least, twist in ((0.0, direct), (_pitch(grasp.dimension, xi), _without_pitch(direct))):
+        if any(twist.velocity) or any(twist.rotation):
+            best = min(best, (_farthest(grasp, lane, twist, least), twist), key=lambda x: x[0])
     return best
 
 
-def _settled(lane: Scaled, xi: np.ndarray, nearby: float) -> np.ndarray:
-    """The part of xi that the contacts hardly moved by it notice to rounding only."""
+def _settled(lane: Scaled, xi: np.ndarray, nearby: float) -> np.ndarray | None:
+    """The part of xi that the contacts hardly moved by it notice to rounding only; None: there is none near xi."""
     k, n = len(lane.torsion), len(lane.kinds)
     rows = lane.A.T.reshape(k, n, -1)
     length = np.linalg.norm(rows, axis=-1)
     unit = rows / np.where(length > 0, length, 1.0)[..., None]
     still = (np.abs(unit @ xi) <= max(STILL, 64 * nearby) * np.linalg.norm(xi)).all(-1)
     if not still.any():
-        return xi
+        return None
     _, values, V = np.linalg.svd(unit[still].reshape(-1, len(xi)))
     values = np.pad(values, (0, len(xi) - len(values)))
     null = V[values <= max(nearby * values[0], values[-1])]
     settled = null.T @ (null @ xi)
     # Another motion is no proof of this one.
     near = np.linalg.norm(settled - xi) <= max(CHANGE, 64 * nearby) * np.linalg.norm(xi)
-    return settled if near else xi
+    return settled if near else None
 
 
-def _farthest(grasp: ExactGrasp, lane: Scaled, twist: Twist, friction: np.ndarray, least: float) -> float:
+def _farthest(grasp: ExactGrasp, lane: Scaled, twist: Twist, least: float) -> float:
     """The distance of the contact that has to change most; at least ``least``."""
     opposed = (i for i in grasp.contacts if grasp.opposes(i, twist))
-    return max([least, *(_contact_distance(grasp, lane, twist, i, float(friction[i])) for i in opposed)])
+    return max([least, *(_contact_distance(grasp, lane, twist, i) for i in opposed)])
 
 
 def _pitch(dimension: int, xi: np.ndarray) -> float:
@@ -80,9 +82,8 @@ def _pitch(dimension: int, xi: np.ndarray) -> float:
     return max(along / float(np.linalg.norm(xi)) - 8 * EPS, 0.0)
 
 
-def without_pitch(grasp: ExactGrasp, lane: Scaled, xi: np.ndarray) -> Twist:
+def _without_pitch(twist: Twist) -> Twist:
     """The twist freed of its translation along its own axis, ``v . omega = 0`` exactly, times a positive number."""
-    twist = twist_of(grasp, physical(lane, grasp.dimension, xi))
     square, pitch = dot(twist.rotation, twist.rotation), dot(twist.velocity, twist.rotation)
     if not square:
         return twist
@@ -96,9 +97,9 @@ def _root(value: Fraction) -> float:
     return float(root) * (1 + 1e-15) if root < 2**1000 else np.inf
 
 
-def _contact_distance(grasp: ExactGrasp, lane: Scaled, twist: Twist, i: int, mu: float) -> float:
+def _contact_distance(grasp: ExactGrasp, lane: Scaled, twist: Twist, i: int) -> float:
     """What it takes to make contact i blind to the twist, or to lower its friction until it gives way."""
-    length = Fraction(lane.length) / Fraction(2) ** grasp.length_exponent
+    mu, length = float(lane.friction[i]), Fraction(lane.length) / Fraction(2) ** grasp.length_exponent
     u, turn = grasp.velocity(i, twist), twist.rotation
     speed, spin = dot(u, u), dot(turn, turn)
     n, nn = grasp.normal[i], grasp.normal_square[i]

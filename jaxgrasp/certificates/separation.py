@@ -13,8 +13,8 @@ from fractions import Fraction
 import numpy as np
 
 from .criteria import Asked
-from .dyadic import ExactGrasp, Twist, exact_grasp, integers
-from .exact_force import scaled_lane
+from .dyadic import ExactGrasp, Twist, integers
+from .exact_force import exact_and_scaled
 from .exact_twist import escape_twist
 from .nearby import rounding_distance
 from .rebuilt import EPS
@@ -66,21 +66,14 @@ def _in_integers(
     asked: Asked, wrench: np.ndarray, twist: np.ndarray, lane: int, nearby: float
 ) -> tuple[int, float]:
     """A twist near the given one that no contact can oppose, and the work of the load along it."""
-    known, live = asked.known, asked.known.live[lane]
-    grasp = exact_grasp(
-        known.position[lane][live],
-        known.normal[lane][live],
-        known.friction[lane][live],
-        known.torsion[lane][live],
-    )
-    scaled = scaled_lane(known, lane, asked.dimension)
+    grasp, scaled = exact_and_scaled(asked.known, lane, asked.dimension)
     exact = escape_twist(grasp, scaled, twist)
     if exact is not None:
         return (2, 0.0) if _power(grasp, exact, wrench) > 0 else (0, np.inf)
     clear = float(twist @ asked.load[lane]) > 64 * nearby * float(
         np.linalg.norm(twist) * np.linalg.norm(asked.load[lane])
     )
-    distance, _ = rounding_distance(grasp, scaled, twist, known.friction[lane][live], nearby)
+    distance, _ = rounding_distance(grasp, scaled, twist, nearby)
     return (1, distance) if clear and distance <= nearby else (0, np.inf)
 
 

@@ -26,7 +26,7 @@ from ..backend import fori_loop, to_lanes, while_loop
 from ..conic import Pair, pair, pair_roundoff, pair_sqrt, pair_sum, pair_where
 from ..contacts import Component, Contacts, normal_first
 from ..core import Array, Status, first_of, frame_components, unit_roundoff
-from .verdict import Verdict
+from .verdict import Verdict, lower_end
 
 __all__ = ["second_attempt"]
 
@@ -358,9 +358,7 @@ def second_attempt(
     room = 256 * unit_roundoff("float64")
     lower = jnp.where(sound, slack - error - (room + 4 * eps) * jnp.abs(slack) - room, -jnp.inf)
     upper = upper + room + (room + 4 * eps) * jnp.abs(upper)
-    # Forces far beyond their mean show nothing, nor do those that contradict the twist by more than rounding.
-    crossed = lower > upper + 4 * (room + 4 * eps) * (1 + jnp.abs(upper))
-    lower = jnp.where((lower < -1 / (64 * eps)) | crossed, -jnp.inf, jnp.minimum(lower, upper))
+    lower = lower_end(lower, upper, (room + 4 * eps) * (1 + jnp.abs(upper)))
     full = first.rank >= m
     status = first_of(
         [

@@ -18,7 +18,7 @@ from ..core import Array, Status, first_of, nan_where, rounding_constant, unit_r
 from .problem import bound_of, upper_bound
 from .rank import Rank, unnoticed
 
-__all__ = ["Verdict", "judge"]
+__all__ = ["Verdict", "judge", "lower_end"]
 
 
 BALANCED = 128  # units of rounding, of |A| |s|: half of what the checker takes for an internal force
@@ -188,9 +188,16 @@ def _bracket(primal: Primal, dual: Dual) -> Bracket:
     eps = unit_roundoff(primal.slack.dtype)
     blur = 16 * eps * (1 + jnp.abs(primal.slack) + jnp.abs(dual.upper))
     lower, upper = primal.slack - blur - primal.near, dual.upper + blur
-    # Forces far beyond their mean show nothing, nor do those that contradict the twist by more than rounding.
-    lower = jnp.where((lower < -1 / (64 * eps)) | (lower > upper + 4 * blur), -jnp.inf, lower)
-    return Bracket(jnp.minimum(lower, upper), upper, blur)  # rounding must not turn the bracket round
+    return Bracket(lower_end(lower, upper, blur), upper, blur)
+
+
+def lower_end(lower: Array, upper: Array, blur: Array) -> Array:
+    """``lower`` as far as it may be said beside ``upper``: rounding, ``blur``, must not turn the bracket round.
+
+    Forces far beyond their mean show nothing, nor do those that contradict the twist by more than rounding.
+    """
+    nothing = (lower < -1 / (64 * unit_roundoff(lower.dtype))) | (lower > upper + 4 * blur)
+    return jnp.where(nothing, -jnp.inf, jnp.minimum(lower, upper))
 
 
 def _status(
