@@ -6,7 +6,8 @@ Equal shares of every kind of grasp: those of ``tests/tables/grasps.py``, contac
 very little of it, and friction within 1e-3 to 1e-9 of the critical one. Each share goes through the five contact
 models (frictionless, hard and soft in space; frictionless and hard in the plane), 1 to 16 contacts, and scales from
 1e-6 to 1e6 m. A lane is undecided in earnest where its status is UNDECIDED and the margin is more than 1e-6 from 0.
-Float32 lanes are the float64 ones, rounded; their brackets are compared with those of the rounded numbers in float64.
+Float32 lanes are the float64 ones, rounded; their brackets are compared with those of the rounded numbers in float64,
+where both are proved exactly.
 """
 
 from __future__ import annotations
@@ -135,10 +136,14 @@ def tally(grasp: jg.Grasp) -> Tally:
     accepted = proof != jg.Status.REFUSED
     contradicted = 0
     if grasp.dtype == np.float32:
-        exact = jg.wrench_resistance(
-            jax.tree.map(lambda x: x if x.dtype == bool else x.astype(np.float64), grasp)
+        wide = jax.tree.map(lambda x: x if x.dtype == bool else x.astype(np.float64), grasp)
+        exact = jg.wrench_resistance(wide)
+        # A proof to rounding speaks of other numbers.
+        both = (proof == jg.Status.PROVED_EXACTLY) & (
+            jg.prove(wide, exact).status == jg.Status.PROVED_EXACTLY
         )
-        contradicted = int(((lower > np.asarray(exact.upper)) | (upper < np.asarray(exact.lower))).sum())
+        apart = (lower > np.asarray(exact.upper)) | (upper < np.asarray(exact.lower))
+        contradicted = int((both & apart).sum())
     is_ = {s: status == s.value for s in jg.Status}
     marginal, undecided = is_[jg.Status.MARGINAL], is_[jg.Status.UNDECIDED]
     return Tally(

@@ -14,12 +14,13 @@ import numpy as np
 
 from .criteria import Asked
 from .rank import rounding_of, smallest_singular_value
-from .rebuilt import EPS
+from .rebuilt import EPS, part_of
 
 __all__ = ["Edges", "Exact", "edges_of", "exact_forces"]
 
 ROUNDS = 2
 LARGEST_STEP = 1e-3  # of the forces
+WIDER = (64.0, 4096.0)  # a step away from one edge may reach another; then that one is kept from, too
 
 
 class Edges(NamedTuple):
@@ -28,6 +29,14 @@ class Edges(NamedTuple):
     cone: np.ndarray
     cap: np.ndarray
     torque: np.ndarray
+
+
+class Matrix(NamedTuple):
+    """What is known of A: its pseudo-inverse (N, k n, m), a proven sigma_min, what rounding hides of A s (N,)."""
+
+    inverse: np.ndarray
+    sigma: np.ndarray
+    rounding: np.ndarray
 
 
 class Exact(NamedTuple):
@@ -57,20 +66,36 @@ def exact_forces(asked: Asked, s: np.ndarray, fine: float) -> Exact:
     A = asked.known.A
     rounding = rounding_of(A)
     sigma = smallest_singular_value(A, rounding)
-    inverse = _pseudo_inverse(A, sigma > 0)
-    s = _balanced(asked, inverse, s)
+    matrix = Matrix(_pseudo_inverse(A, sigma > 0), sigma, rounding)
+    s = _balanced(asked, matrix.inverse, s)
+    exact = _moved_inwards(asked, matrix, s, fine)
+    for wider in WIDER:
+        again = np.flatnonzero((sigma > 0) & ~exact.shown)
+        if again.size:
+            part = _moved_inwards(part_of(asked, again), part_of(matrix, again), s[again], wider * fine)
+            for whole, new in zip(exact, part, strict=True):
+                whole[again] = new
+    return exact
+
+
+def _moved_inwards(asked: Asked, matrix: Matrix, s: np.ndarray, fine: float) -> Exact:
+    """One attempt: away from the edges nearer than 64 ``fine``, or too near to show anything."""
     size = np.linalg.norm(s.reshape(len(s), -1), axis=-1)
-    shift = _shift(asked, s, sigma, rounding)
-    direction, gains = _inwards(asked, inverse, s, 64 * fine * size)
+    shift = _shift(asked, matrix, s)
+    rooms, needs = edges_of(asked, s), _needs(asked, s, shift)
+    near = (64 * fine * size)[:, None]
+    touched = Edges(*(room <= np.maximum(near, 4 * need) for room, need in zip(rooms, needs, strict=True)))
+    idle = asked.known.live & (np.linalg.norm(s, axis=-1) <= near)
+    direction, gains = _inwards(asked, matrix.inverse, s, touched, idle)
     step = np.zeros(len(s))
-    for gain, room, need in zip(gains, edges_of(asked, s), _needs(asked, s, shift), strict=True):
+    for gain, room, need in zip(gains, rooms, needs, strict=True):
         missing = np.where(gain > 0, 3 * need - room, 0.0) / np.where(gain > 0, gain, 1.0)
         step = np.maximum(step, np.max(np.where(np.isfinite(missing), missing, 0.0), -1, initial=0.0))
     length = np.linalg.norm(direction.reshape(len(s), -1), axis=-1)
     step = np.where(step * length <= LARGEST_STEP * size, step, 0.0)
-    s = _balanced(asked, inverse, s + step[:, None, None] * direction)
-    shift = _shift(asked, s, sigma, rounding)
-    shown = (sigma > 0) & np.isfinite(shift)
+    s = _balanced(asked, matrix.inverse, s + step[:, None, None] * direction)
+    shift = _shift(asked, matrix, s)
+    shown = (matrix.sigma > 0) & np.isfinite(shift)
     for room, need in zip(edges_of(asked, s), _needs(asked, s, shift), strict=True):
         shown &= (room > need).all(-1)
     return Exact(s, shift, shown)
@@ -100,8 +125,9 @@ def _balanced(asked: Asked, inverse: np.ndarray, s: np.ndarray) -> np.ndarray:
     return s
 
 
-def _shift(asked: Asked, s: np.ndarray, sigma: np.ndarray, rounding: np.ndarray) -> np.ndarray:
+def _shift(asked: Asked, matrix: Matrix, s: np.ndarray) -> np.ndarray:
     """(N,) exact forces are no farther; infinite where the rank is not proved."""
+    _, sigma, rounding = matrix
     left = np.linalg.norm(_residual(asked, s), axis=-1)
     left = left + rounding * np.linalg.norm(s.reshape(len(s), -1), axis=-1)
     left = left + 8 * EPS * np.linalg.norm(asked.load, axis=-1)
@@ -122,16 +148,13 @@ def _needs(asked: Asked, s: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _inwards(
-    asked: Asked, inverse: np.ndarray, s: np.ndarray, near: np.ndarray
-) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """d (N, k, n) with A d = 0 that leads inwards at all edges nearer than ``near``, at rate 1; and its rates there.
+    asked: Asked, inverse: np.ndarray, s: np.ndarray, touched: Edges, idle: np.ndarray
+) -> tuple[np.ndarray, Edges]:
+    """d (N, k, n) with A d = 0 that leads inwards at all ``touched`` edges, at rate 1; and its rates there.
 
-    The smallest such d. Rates are 0 at the edges that are far; a contact without force moves along its normal.
+    The smallest such d. Rates are 0 at the others; contacts that are ``idle`` (N, k) move along their normals.
     """
     lanes, k, n = s.shape
-    rooms = edges_of(asked, s)
-    idle = asked.known.live & (np.linalg.norm(s, axis=-1) <= near[:, None])
-    touched = [room <= near[:, None] for room in rooms]
     tail = np.linalg.norm(s[..., 1:], axis=-1)
     unit = s[..., 1:] / np.where(tail > 0, tail, 1.0)[..., None]
     unit = np.where(idle[..., None], 0.0, unit)
@@ -164,4 +187,4 @@ def _inwards(
     ).reshape(s.shape)
     rates = np.einsum("lrj,lj->lr", rows, d.reshape(lanes, -1)) * active
     cone, cap = rates[:, :k], rates[:, k : 2 * k]
-    return d, (cone, cap, rates[:, 2 * k :] * reach)
+    return d, Edges(cone, cap, rates[:, 2 * k :] * reach)

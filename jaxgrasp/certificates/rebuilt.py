@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,7 @@ __all__ = [
     "ROUNDING",
     "Rebuilt",
     "component_vectors",
+    "part_of",
     "rebuild",
     "scaled_force",
     "scaled_twist",
@@ -21,6 +22,17 @@ __all__ = [
 ROUNDING = 16.0  # c
 RANK_TOLERANCE = 64.0  # in units of eps of the grasp's dtype, relative to the largest singular value
 EPS = float(np.finfo(np.float64).eps)
+
+
+def part_of(arrays: Any, lanes: slice | np.ndarray) -> Any:
+    """Some lanes of a named tuple of arrays, or of named tuples of them; what is no array belongs to all."""
+
+    def part(x: Any) -> Any:
+        if hasattr(x, "_asdict"):
+            return part_of(x, lanes)
+        return x[lanes] if isinstance(x, np.ndarray) else x
+
+    return arrays._replace(**{name: part(x) for name, x in arrays._asdict().items()})
 
 
 def _frame(normal: np.ndarray) -> list[np.ndarray]:

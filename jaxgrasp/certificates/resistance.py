@@ -25,7 +25,7 @@ from .exact_lane import ExactLane
 from .proof import LEVELS, Proof
 from .rank import numeric_rank_fits, rounding_of, smallest_singular_value
 from .reading import Fields
-from .rebuilt import EPS, Rebuilt, rebuild, scaled_force, scaled_twist
+from .rebuilt import EPS, Rebuilt, part_of, rebuild, scaled_force, scaled_twist
 
 __all__ = ["claim_of", "of_size_one", "prove_resistance"]
 
@@ -84,7 +84,7 @@ def prove_resistance(grasp, answer, tolerance: float | None = None) -> Proof:
     eps = float(np.finfo(np.dtype(grasp.position.dtype)).eps)
     with np.errstate(all="ignore"):
         parts = [
-            _proved(_part(known, lanes), _part(claim, lanes), dimension, eps, tolerance)
+            _proved(part_of(known, lanes), part_of(claim, lanes), dimension, eps, tolerance)
             for lanes in _slices(len(known.valid))
         ]
     level, distance = (np.concatenate(x).reshape(batch) for x in zip(*parts, strict=True)) if parts else (
@@ -97,12 +97,6 @@ def prove_resistance(grasp, answer, tolerance: float | None = None) -> Proof:
 
 def _slices(count: int) -> list[slice]:
     return [slice(start, start + LANES) for start in range(0, count, LANES)]
-
-
-def _part(arrays, lanes: slice):
-    return arrays._replace(
-        **{name: x[lanes] for name, x in arrays._asdict().items() if isinstance(x, np.ndarray)}
-    )
 
 
 def _unit(x: np.ndarray) -> np.ndarray:

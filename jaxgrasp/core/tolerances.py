@@ -16,6 +16,7 @@ __all__ = [
     "gap_goal",
     "load_limit",
     "largest_response",
+    "largest_sensitivity",
     "pivot_tolerance",
     "perturbation_tolerance",
     "proven_gap",
@@ -50,6 +51,15 @@ def gap_goal(tolerance: ArrayLike, dtype: DTypeLike) -> Array:
     if isinstance(tolerance, int | float):
         return placed(np.asarray(max(tolerance, floor), dtype))
     return jnp.maximum(jnp.asarray(tolerance, dtype), jnp.asarray(floor, dtype))
+
+
+def largest_sensitivity(dtype) -> float:
+    """Relative error of a robust cost per relative error of its forces, where both can still be told: 5e5, or 512.
+
+    Beyond, 8 eps of the forces would change the cost by more than 1e-9 (float64) or 5e-4 (float32) of it, which is
+    what its proof allows to rounding.
+    """
+    return max(1e-9, 4096 * unit_roundoff(dtype)) / (8 * unit_roundoff(dtype))
 
 
 def rank_tolerance(dtype) -> float:

@@ -18,7 +18,6 @@ from ..conic import (
     ConvexPoint,
     ConvexState,
     cone_max,
-    cone_min,
     cone_sum,
     inner,
     interior_distance,
@@ -28,17 +27,22 @@ from ..conic import (
     vector_norm,
 )
 from ..contacts import Folded, to_body, to_twist, unfold
-from ..core import Array, Status, edge_tolerance, first_of, nan_where, proven_gap, proven_limit, unit_roundoff
-from .bounds import criterion_value, dual_value
+from ..core import (
+    Array,
+    Status,
+    edge_tolerance,
+    first_of,
+    largest_sensitivity,
+    nan_where,
+    proven_gap,
+    proven_limit,
+    unit_roundoff,
+)
+from .bounds import barrier_loss, cost_sensitivity, criterion_value, dual_value
 from .infeasibility import proven_separation
 from .problem import ForceProblem, Load
 
 __all__ = ["Answer", "answer"]
-
-
-BARRED = (
-    1024  # units of rounding, of the largest force: nearer to its cone's edge no barrier can be evaluated
-)
 
 
 class Answer(NamedTuple):
@@ -140,15 +144,6 @@ def _imbalance(folded: Folded, u: Cone, load: Load) -> Array:
 
 
 @stage
-def _depth(program: ConvexConeProgram, u: Cone) -> Array:
-    """How far u is inside the cones, relative to the largest force (L,)."""
-    largest = cone_max(program.exists * jnp.abs(u[0]))
-    inside = interior_distance(u)
-    least = cone_min(jnp.where(program.exists > 0, inside, jnp.full_like(inside, jnp.inf)))
-    return least / jnp.where(largest > 0, largest, jnp.ones_like(largest))
-
-
-@stage
 def _status(
     lanes: Lanes, values: Values, proofs: Proofs, admissible: Array, smoothing: Array | None,
     tolerance: Array,
@@ -189,8 +184,11 @@ def answer(problem: ForceProblem, state: ConvexState, tolerance: Array) -> Answe
     load = load._replace(rest=load.rest & (problem.demand.criterion.barrier_weight is None))
     worst = jnp.maximum(_violation(program, u), _imbalance(problem.tile.folded, u, load))
     admissible = (worst <= edge_tolerance(dtype)) & jnp.isfinite(values.cost) & ~load.off
-    if problem.demand.criterion.barrier_weight is not None:
-        admissible = admissible & (_depth(program, u) >= BARRED * unit_roundoff(dtype))
+    barrier = problem.demand.barrier()
+    if barrier is not None:  # too near to the edge no barrier can be evaluated
+        admissible = admissible & (
+            cost_sensitivity(program, u, load.size, barrier) <= largest_sensitivity(dtype)
+        )
     status = _status(
         Lanes(problem.valid, load.off, load.rest, state.stop),
         values,
@@ -263,14 +261,19 @@ def _rounding(program: ConvexConeProgram, rows: Array, u: Cone, size: Array) -> 
 def _stored(folded: Folded, program: ConvexConeProgram, found: Multipliers, u: Cone, load: Load) -> Array:
     """What it can lose when it is evaluated again from the twist of A, in float64 and with all rounding allowed for."""
     m, joints = program.rhs.shape[0], found.rows.shape[0] - program.rhs.shape[0]
-    forces, speed = jnp.sqrt(cone_sum(program.exists * inner(u, u))), vector_norm(found.twist)
-    blur = folded.norm * speed * forces * load.size + speed * vector_norm(load.wrench)
+    speed = vector_norm(found.twist)
+    blur = folded.norm * speed
     if joints:
         square = [cone_sum(inner(*[tuple(c[j] for c in program.columns)] * 2)) for j in range(m, m + joints)]
-        blur = blur + vector_norm(found.rows[m:]) * jnp.sqrt(reduce(jnp.add, square)) * forces * load.size
+        blur = blur + vector_norm(found.rows[m:]) * jnp.sqrt(reduce(jnp.add, square))
     terms = 32 + len(u) + joints if blur.dtype == jnp.float64 else 8
-    blur = jnp.asarray(terms * unit_roundoff(blur.dtype), blur.dtype) * blur
-    return blur * load.size if program.curvature is not None else blur
+    unit = jnp.asarray(terms * unit_roundoff(blur.dtype), blur.dtype)
+    if program.head_floor is None:
+        loss = unit * blur * jnp.sqrt(cone_sum(program.exists * inner(u, u)))
+    else:
+        loss = barrier_loss(program, found.rows, u, unit * blur)
+    loss = loss * load.size + unit * speed * vector_norm(load.wrench)
+    return loss * load.size if program.curvature is not None else loss
 
 
 @stage

@@ -16,6 +16,7 @@ from ..conic import (
     ConvexConeProgram,
     Curvature,
     cone_max,
+    cone_min,
     cone_sum,
     determinant,
     entries,
@@ -27,7 +28,7 @@ from ..conic import (
 )
 from ..core import Array
 
-__all__ = ["criterion_value", "dual_value"]
+__all__ = ["barrier_loss", "cost_sensitivity", "criterion_value", "dual_value"]
 
 
 class Barrier(NamedTuple):
@@ -73,6 +74,17 @@ def criterion_value(
     if barrier is None:
         return top
     return top - _log_det(barrier, program.exists, u, size)
+
+
+@stage
+def cost_sensitivity(program: ConvexConeProgram, u: Cone, size: Array, barrier: Barrier) -> Array:
+    """What relative errors of the forces ``size u`` do to the robust cost, over that cost: infinite on an edge."""
+    one, tail = jnp.ones_like(u[0]), tail_norm(u)
+    counted = (program.exists > 0) & (barrier.on_cone > 0)
+    gap = jnp.where(counted, u[0] - tail, one)
+    slopes = jnp.where(counted, barrier.on_cone * u[0], 0 * one) / jnp.where(gap > 0, gap, one)
+    worst = barrier.weight * cone_sum(slopes) / (size * _top(program.exists, u) + barrier.weight)
+    return jnp.where(cone_min(gap) > 0, worst, jnp.full_like(worst, jnp.inf))
 
 
 class DualPoint(NamedTuple):
@@ -176,9 +188,12 @@ def _barrier_prices(program: ConvexConeProgram, x: Cone, u: Cone) -> BarrierPric
     share = _level_multipliers(needed, program.cap, one[0])
     paid, over = jnp.zeros_like(one[0]), zero
     if program.cap is not None:
-        finite = jnp.isfinite(program.cap) & (exists > 0)
-        over = jnp.where(finite, needed - share, zero)
-        paid = cone_sum(over * jnp.where(finite, program.cap, zero))
+        # Below its cap a contact lacks little by rounding of the level alone: to pay the cap for it would cost more.
+        lacking = needed - share
+        paying = (program.cap <= top) | (lacking > jnp.where(phi > 0, wanted - tail, psi / level) / 2)
+        paying = paying & jnp.isfinite(program.cap) & (exists > 0)
+        over = jnp.where(paying, lacking, zero)
+        paid = cone_sum(over * jnp.where(paying, program.cap, zero))
     spare = jnp.maximum(one[0] - cone_sum(share), zero[0]) / jnp.maximum(cone_sum(leads), one[0])
     head = share + leads * spare + over + x[0]
     # A contact without barrier only needs z in its cone.
@@ -239,6 +254,19 @@ def dual_value(
         return _scaled(_linear_bound(program, dual), size)
     assert barrier is not None
     return _unscaled(_barrier_bound(program, dual, u), barrier, program.exists, size)
+
+
+@stage
+def barrier_loss(program: ConvexConeProgram, rows: Array, u: Cone, blur: Array) -> Array:
+    """What the bound loses where all x_0 are less by ``blur`` (L,): infinite where z may leave its cone."""
+    x, phi, psi = rmatvec(program.columns, rows), program.cone_floor, program.head_floor
+    prices, tail, exists = _barrier_prices(program, x, u), tail_norm(x), program.exists > 0
+    zero, one = jnp.zeros_like(tail), jnp.ones_like(tail)
+    gap = jnp.where(phi > 0, prices.head - tail, prices.price)
+    inside = exists & (gap > 4 * blur)
+    slope = jnp.where(phi > 0, phi * prices.head / (prices.head + tail), psi) / jnp.where(inside, gap, one)
+    loss = 1.2 * blur * cone_sum(jnp.where(inside, slope, zero))
+    return jnp.where(cone_max(jnp.where(exists & ~inside, one, zero)) > 0, jnp.full_like(loss, jnp.inf), loss)
 
 
 @stage
