@@ -166,28 +166,23 @@ def _shown(asked: Asked, claim: Claim, eps: float) -> tuple[Shown, Shown]:
     given = _admissible(asked, claim.s, FINE * eps)
     exact = exact_forces(asked, claim.s, FINE * eps)
     near, distance = _pulled_in(asked, claim.s, exact.s, NEARBY * eps)
-    nothing = np.zeros(len(near))
-    return (
-        _of_forces(asked, claim, exact.s, exact.shift, given & exact.shown, nothing),
-        _of_forces(asked, claim, near, nothing, given & (distance <= NEARBY * eps), distance),
-    )
+    nothing, lower = np.zeros(len(near)), _proved_bound(asked, claim)
+    top, moved = _of_forces(asked, claim, exact.s, exact.shift, given & exact.shown)
+    exactly = Shown(top, lower, nothing, moved)
+    top, moved = _of_forces(asked, claim, near, nothing, given & (distance <= NEARBY * eps))
+    return exactly, Shown(top, lower, distance, moved)
 
 
 def _of_forces(
-    asked: Asked, claim: Claim, s: np.ndarray, shift: np.ndarray, admissible: np.ndarray, distance: np.ndarray
-) -> Shown:
-    """The cost of forces within ``shift`` of s, rounded up, and the bound of the multipliers, rounded down."""
+    asked: Asked, claim: Claim, s: np.ndarray, shift: np.ndarray, admissible: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The cost of forces within ``shift`` of s, rounded up, and by what share of the largest force they differ."""
     value, size = cost(asked, s)
     change = cost_change(asked, s, np.where(admissible, shift, 0.0))
     top = value + change + 4 * (s.shape[1] * s.shape[2] + 8) * EPS * np.maximum(size, np.abs(value))
     largest = np.max(np.abs(claim.s), (-1, -2), initial=0.0)
     moved = np.max(np.abs(s - claim.s), (-1, -2), initial=0.0) + np.where(admissible, shift, 0.0)
-    return Shown(
-        np.where(admissible, top, np.inf),
-        _proved_bound(asked, claim, s),
-        distance,
-        moved / np.where(largest > 0, largest, 1.0),
-    )
+    return np.where(admissible, top, np.inf), moved / np.where(largest > 0, largest, 1.0)
 
 
 def _admissible(asked: Asked, s: np.ndarray, fine: float) -> np.ndarray:
@@ -251,12 +246,14 @@ def _missing_torque(asked: Asked, s: np.ndarray) -> np.ndarray:
     return np.max(over / np.where(size > 0, size, 1.0), -1, initial=0.0)
 
 
-def _proved_bound(asked: Asked, claim: Claim, s: np.ndarray) -> np.ndarray:
+def _proved_bound(asked: Asked, claim: Claim) -> np.ndarray:
     """A lower bound of the optimal cost: the dual function at x_i smaller by what rounding can do to it.
 
-    The dual function grows with x in the order of the (self-dual) cones.
+    The dual function grows with x in the order of the (self-dual) cones. It holds wherever it is taken; forces that
+    are only near the optimal ones make it lower.
     """
-    y, rates, known, jacobian = claim.load_twist, claim.joint_rates, asked.known, asked.scaled_jacobian()
+    s, y, rates, known = claim.s, claim.load_twist, claim.joint_rates, asked.known
+    jacobian = asked.scaled_jacobian()
     k, n, joints = jacobian.shape[1:]
     x = np.einsum("lkij,li->lkj", known.blocks, y) + np.einsum("lkcj,lj->lkc", jacobian, rates)
     blur = np.linalg.norm(known.blocks, axis=(-2, -1)) * np.linalg.norm(y, axis=-1)[:, None]

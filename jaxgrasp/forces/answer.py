@@ -269,7 +269,7 @@ def _stored(folded: Folded, program: ConvexConeProgram, found: Multipliers, u: C
     terms = 32 + len(u) + joints if blur.dtype == jnp.float64 else 8
     unit = jnp.asarray(terms * unit_roundoff(blur.dtype), blur.dtype)
     if program.head_floor is None:
-        loss = unit * blur * jnp.sqrt(cone_sum(program.exists * inner(u, u)))
+        loss = unit * blur * cone_sum(program.exists * jnp.abs(u[0]))
     else:
         loss = barrier_loss(program, found.rows, u, unit * blur)
     loss = loss * load.size + unit * speed * vector_norm(load.wrench)
