@@ -1,5 +1,6 @@
 """Optimal forces against Clarabel: 3 000 problems a criterion, with and without limits, feasible or not."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -90,6 +91,44 @@ def test_clarabel_agrees(criterion, runs):
         assert (error < 1e-7).all(), np.sort(error)[-5:]
         # Loads at the very edge of what can be held, or of the limits: an honest answer, but one too many.
         assert (stalled & (answer != "unknown")).mean() < STALLED_SHARE
+
+
+# (model, limits, criterion): lanes of 2500 problems of a seed at which proofs were refused, or hold to rounding only.
+# Level below all caps, torque or cap between the edges that are touched and those that are clear, loads on an edge.
+NEAR_EDGES = {
+    ("soft", True, "robust"): {1: [543, 980, 1209, 1262], 2: [983]},
+    ("hard", True, "robust"): {1: [99, 722, 752, 2442], 2: [362, 480, 2166]},
+    ("planar hard", False, "robust"): {0: [470, 546]},
+    ("planar hard", True, "robust"): {0: [546], 1: [1472, 1695], 2: [757, 2346]},
+    ("hard", True, "smallest sum"): {0: [1665], 1: [541, 2061]},
+    ("hard", True, "least norm"): {1: [2442]},
+}
+BARELY_HELD = {("hard", True, "smallest sum", 0, 1665)}  # full rank, but the load is on an edge: to rounding
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        pytest.param(row, id=", ".join(map(str, row)), marks=() if row[0] == "soft" else pytest.mark.slow)
+        for row in NEAR_EDGES
+    ],
+)
+def test_proofs_hold_near_every_edge(row):
+    name, limits, criterion = row
+    make, parameter = CRITERIA[criterion]
+    for seed, lanes in NEAR_EDGES[row].items():
+        grasp, _, wrench, cap, limit = problems(name, limits, 2500, seed)
+        pick = np.array(lanes)
+        grasp, wrench, cap, limit = jax.tree.map(lambda x, pick=pick: x[pick], (grasp, wrench, cap, limit))
+        asked = {"criterion": make(parameter), "max_normal": cap, "torque_limits": limit}
+        out = jg.optimize_forces(grasp, wrench, **asked)
+        proof = jg.prove(grasp, out, wrench=wrench, **asked).status
+        values = np.linalg.svd(np.asarray(jg.contacts.folded_grasp_map(grasp)), compute_uv=False)
+        rank = 3 if grasp.dimension == 2 else 6
+        full = values[:, rank - 1] > 1e-9 * values[:, 0]
+        full &= [(*row, seed, lane) not in BARELY_HELD for lane in lanes]
+        assert (proof != Status.REFUSED).all(), (seed, lanes, proof)
+        assert (proof[full] == Status.PROVED_EXACTLY).all(), (seed, lanes, proof)
 
 
 def test_there_are_enough_problems():
