@@ -208,9 +208,11 @@ def _robust_bound(asked: Asked, s: np.ndarray, x: np.ndarray, gain: np.ndarray) 
     needed = np.where(live, np.maximum(z_head + psi / level - x[..., 0], 0.0), 0.0)
     p = psi / np.where(live & (needed <= 0), s[..., 0], level)
     share = _level_multipliers(needed, cap)
-    # Below its cap a contact lacks little by rounding of the level alone: to pay the cap for it would cost more.
-    lacking, wanted = needed - share, np.where(phi > 0, z_head - x_tail, psi / level)
-    paying = np.isfinite(cap) & ((cap <= head.max(-1, keepdims=True)) | (lacking > wanted / 2))
+    # What is lacking costs the cap beyond the level, or, unpaid, a second-order loss of the barrier: the less.
+    lacking = needed - share
+    floor, gap = np.where(phi > 0, (phi, z_head - x_tail), (psi, psi / level))
+    cheaper = (cap - head.max(-1, keepdims=True)) * gap * gap <= floor / 2 * lacking
+    paying = np.isfinite(cap) & (cheaper | (lacking > gap / 2))
     alpha = np.where(paying, lacking, 0.0)
     leads = live & (head >= head.max(-1, keepdims=True))
     spare = np.maximum(1.0 - share.sum(-1, keepdims=True), 0.0) * leads / leads.sum(-1, keepdims=True)

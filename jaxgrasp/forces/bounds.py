@@ -188,10 +188,11 @@ def _barrier_prices(program: ConvexConeProgram, x: Cone, u: Cone) -> BarrierPric
     share = _level_multipliers(needed, program.cap, one[0])
     paid, over = jnp.zeros_like(one[0]), zero
     if program.cap is not None:
-        # Below its cap a contact lacks little by rounding of the level alone: to pay the cap for it would cost more.
+        # What is lacking costs the cap beyond the level, or, unpaid, a second-order loss of the barrier: the less.
         lacking = needed - share
-        paying = (program.cap <= top) | (lacking > jnp.where(phi > 0, wanted - tail, psi / level) / 2)
-        paying = paying & jnp.isfinite(program.cap) & (exists > 0)
+        gap, floor = jnp.where(phi > 0, wanted - tail, psi / level), jnp.where(phi > 0, phi, psi)
+        cheaper = (program.cap - top) * gap * gap <= floor / 2 * lacking
+        paying = (cheaper | (lacking > gap / 2)) & jnp.isfinite(program.cap) & (exists > 0)
         over = jnp.where(paying, lacking, zero)
         paid = cone_sum(over * jnp.where(paying, program.cap, zero))
     spare = jnp.maximum(one[0] - cone_sum(share), zero[0]) / jnp.maximum(cone_sum(leads), one[0])
