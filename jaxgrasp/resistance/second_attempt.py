@@ -349,6 +349,7 @@ def second_attempt(
     exists = (scale[0] > 0).astype(length.dtype)
     problem = _Problem(A, scale, *_orthonormal(A), exists, length, dimension)
     s, y = _path(problem, tolerance)
+    s = _projected(problem, s)  # what is stored balances to rounding
     stored, slack, error, sound = _force(problem, s)
     twist, upper, depth = _twist(problem, y)
 
