@@ -294,6 +294,43 @@ def test_every_contact_model(norm, name):
     assert np.mean(np.asarray(q.width)[resistant] <= 0.01) >= 0.99
 
 
+PLANAR = {  # norm: positions, normals, friction
+    "Linf": (
+        [[1.0, -0.27710692747975063], [-0.6740479098057703, 1.0], [-1.0, 0.03981048180497937], [1.0, 0.8378955940061579]],
+        [[-1.0, 0.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]],
+        0.0,
+    ),
+    "L1": (
+        [
+            [0.012605073292335952, 0.022365187437492336],
+            [0.026958607222740155, 0.024620470029656772],
+            [0.01670167386354499, 0.04007658999246538],
+            [0.02871482169382895, 0.03019514587850878],
+        ],
+        [
+            [0.6110120401089807, 0.7916213026705771],
+            [-0.8243413529314396, 0.5660930434541337],
+            [0.2013519829880769, -0.9795189528267276],
+            [-0.9999628000403193, 0.008625458568932725],
+        ],
+        1.1045378964680608e-05,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("norm", "least"), [("Linf", 0.0), ("L1", 1.967e-6)])
+def test_qualities_as_small_as_rounding_are_accepted(norm, least):
+    """An epsilon of 0 to rounding, and one of 2e-6: what rounding can do is relative to the map, not to epsilon."""
+    position, normal, friction = PLANAR[norm]
+    grasp = jg.Grasp(position, normal, jg.HardFinger(friction))
+    q = jg.epsilon_quality(grasp, norm=norm, certificate=True)
+    assert least <= float(q.upper) < least + 1e-9
+    assert q.status == (Status.RESISTANT if least else Status.MARGINAL)
+    assert jg.check(grasp, q)
+    low = jg.prove(grasp, q).lower
+    assert 0 <= low <= q.upper
+
+
 def test_mistakes_are_answered(grasp):
     with pytest.raises(ValueError, match="norm must be one of L1, Linf"):
         jg.epsilon_quality(grasp, norm="L2")

@@ -6,7 +6,8 @@
     NOT_RESISTANT  both bounds are 0, and ``direction`` is the negative of a twist that no contact can oppose
     touching       forces in their cones with unit effort at most
 
-Both bounds are proved to 1e-9 of epsilon (64 eps of float32); the proof states its own, rounded outwards.
+Both bounds are proved to 1e-9 of epsilon (64 eps of float32), and to rounding of the map; the proof states its own,
+rounded outwards.
 """
 
 from __future__ import annotations
@@ -116,25 +117,25 @@ class _Lane:
             level, distance = self._escapes() if upper == 0 else (0, np.inf)
             return (level, distance, 0.0, 0.0) if level else nothing
         direction = claim.direction[lane] / length
-        top, terms = (
-            self._support(direction),
-            float((np.abs(self.blocks).sum((0, 2)) * np.abs(direction)).sum()),
-        )
-        if not top <= upper * (1 + self.room) + 16 * self.eps * terms:
+        shown, top = self._support(direction)
+        terms = float((np.abs(self.blocks).sum((0, 2)) * np.abs(direction)).sum())
+        if not shown <= upper * (1 + self.room) + 16 * self.eps * terms:
             return nothing
         if status == RESISTANT and lower > 0:
-            ball = self._ball()
-            return (2, 0.0, ball, top) if ball >= lower * (1 - self.room) else nothing
+            ball, fine = self._ball(), NEARBY * self.eps * self.size
+            return (2, 0.0, ball, top) if ball > 0 and ball + fine >= lower * (1 - self.room) else nothing
         idle = status == UNDECIDED or (status == MARGINAL and self._nearly_escapes())
         return (2, 0.0, 0.0, top) if idle and lower == 0 else nothing
 
-    def _support(self, direction: np.ndarray) -> float:
-        """h(direction), rounded up."""
+    def _support(self, direction: np.ndarray) -> tuple[float, float]:
+        """h(direction), as floating point has it and rounded up."""
         v = np.einsum("kmn,m->kn", self.blocks, direction)
         blur = 32 * EPS * np.linalg.norm(self.blocks, axis=(-2, -1))
-        h = np.where(self.live, v[:, 0] + np.linalg.norm(v[:, 1:], axis=-1) + blur, 0.0)
-        h = np.maximum(h, 0.0)
-        return float(h.sum() * (1 + len(h) * EPS) if self.claim.norm == "Linf" else h.max())
+        h = np.where(self.live, v[:, 0] + np.linalg.norm(v[:, 1:], axis=-1), 0.0)
+        shown, top = np.maximum(h, 0.0), np.maximum(np.where(self.live, h + blur, 0.0), 0.0)
+        if self.claim.norm == "Linf":
+            return float(shown.sum()), float(top.sum() * (1 + len(h) * EPS))
+        return float(shown.max()), float(top.max())
 
     def _unit_effort(self, forces: np.ndarray) -> tuple[np.ndarray, bool]:
         """Scaled forces (V, k, n) pulled into their cones and to unit effort; whether that was rounding."""
