@@ -94,8 +94,8 @@ def test_clarabel_agrees(criterion, runs):
 
 
 # (model, limits, criterion): lanes of 2500 problems of a seed at which proofs were refused, or hold to rounding only.
-# A level below all caps or at one; a torque or cap between the edges that are touched and those that are clear; loads on
-# an edge.
+# A level below all caps or at one; a torque or cap between the edges that are touched and those that are clear; loads
+# on an edge.
 NEAR_EDGES = {
     ("soft", True, "robust"): {0: [338, 382, 957, 2381], 1: [543, 980, 1209, 1262], 2: [983]},
     ("hard", True, "robust"): {1: [99, 722, 752, 2442], 2: [362, 480, 2166]},
