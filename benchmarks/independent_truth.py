@@ -1,4 +1,4 @@
-"""Verdicts and brackets against 70 decimal digits, on grasps drawn towards the boundary between yes and no.
+"""Verdicts, brackets and costs against 70 decimal digits, on problems drawn towards the boundary between yes and no.
 
     python benchmarks/independent_truth.py [--json FILE] [--markdown FILE] [--count 100]
 
@@ -6,6 +6,11 @@
 (frictionless grasps as they come), and as many of the kinds of ``tests/tables/grasps.py``. The margin t* is enclosed by
 weak duality in 70 digits (``tests/tables/exact_margin.py``), which shares no code with jaxgrasp and trusts no solver.
 A contradiction is a proved verdict of the other sign, or a proved end of a bracket on the wrong side.
+
+Then ``--forces`` problems of ``tests/tables/force_problems.py`` for each contact model, with the gentlest forces and
+with the smallest sum: loads inside the cones, on their edge, just beyond it. The cost is enclosed in 70 digits
+(``tests/tables/exact_forces.py``). A contradiction is a bound above it or a cost below it, and a load called INFEASIBLE
+that a grasp that holds every load, in 70 digits, can hold.
 """
 
 from __future__ import annotations
@@ -23,12 +28,19 @@ import jaxgrasp as jg
 from jaxgrasp import Status
 
 ExactMap: Any = importlib.import_module("exact_margin").ExactMap
+ExactForces: Any = importlib.import_module("exact_forces").ExactForces
+force_problems: Any = importlib.import_module("force_problems")
 WIDTHS = (2, 4, 8)
+NOTHING = float("inf")
+SAID = {Status.PROVED_EXACTLY.value: "proved exactly", Status.PROVED_TO_ROUNDING.value: "to rounding"}
 KINDS = ("near critical", "near critical", "box", "tilted")
 COLUMNS = (
     "lanes", "proved exactly", "to rounding", "refused", "undecided by the solver", "no full rank in 70 digits",
     "settled in 70 digits", "contradictions",
 )  # fmt: skip
+
+
+TIGHT = 1e-6  # of the cost: a wider enclosure settles nothing
 
 
 def contradicts(grasp: Any, answer, force) -> tuple[bool, bool]:
@@ -44,28 +56,27 @@ def contradicts(grasp: Any, answer, force) -> tuple[bool, bool]:
     return settled, bool(wrong)
 
 
+def exact_map(grasp: jg.Grasp, i: int) -> Any:
+    """Grasp ``i`` in 70 digits."""
+    live, model = np.asarray(grasp.active[i]), grasp.model
+    arrays = (grasp.position, grasp.normal, model.friction_coefficient, model.torsion_coefficient)
+    names = [c.value for c in model.components(grasp.dimension)]
+    return ExactMap(*(np.asarray(x[i])[live] for x in arrays), names)
+
+
 def measure(model, width: int, kind: str, count: int, chunk: int) -> Counter:
     """One table row's worth of lanes."""
     grasp = model.grasp(*draw(kind, model, width, count, chunk))
     answer = jg.wrench_resistance(grasp)
     proof, out = jg.prove(grasp, answer), Counter(lanes=count)
-    names = [c.value for c in grasp.model.components(grasp.dimension)]
     answer: Any = jax.tree.map(np.asarray, answer)
-    mu, gamma = np.asarray(grasp.model.friction_coefficient), np.asarray(grasp.model.torsion_coefficient)
     for i in range(count):
-        how = Status(int(proof.status[i]))
-        out[{23: "proved exactly", 24: "to rounding"}.get(int(how), "refused")] += 1
+        out[SAID.get(int(proof.status[i]), "refused")] += 1
         out["undecided by the solver"] += int(answer.status[i]) == Status.UNDECIDED
         live = np.asarray(grasp.active[i])
-        if int(how) != Status.PROVED_EXACTLY:
+        if int(proof.status[i]) != Status.PROVED_EXACTLY:
             continue
-        exact = ExactMap(
-            np.asarray(grasp.position[i])[live],
-            np.asarray(grasp.normal[i])[live],
-            mu[i][live],
-            gamma[i][live],
-            names,
-        )
+        exact = exact_map(grasp, i)
         if not exact.full_rank:
             out["no full rank in 70 digits"] += 1
             continue
@@ -76,9 +87,42 @@ def measure(model, width: int, kind: str, count: int, chunk: int) -> Counter:
     return out
 
 
+def measure_forces(name: str, criterion: str, count: int) -> Counter:
+    """The same of optimal forces."""
+    grasp, _, wrench, _, _ = force_problems.problems(name, False, count, seed=5)
+    make, parameter = force_problems.CRITERIA[criterion]
+    asked = {"wrench": wrench, "criterion": make(parameter)}
+    forces = jg.optimize_forces(grasp, **asked)
+    proof, out = jg.prove(grasp, forces, **asked), Counter(lanes=count)
+    answer, held = (jax.tree.map(np.asarray, x) for x in (forces, jg.wrench_resistance(grasp)))
+    for i in range(count):
+        out[SAID.get(int(proof.status[i]), "refused")] += 1
+        out["undecided by the solver"] += int(answer.status[i]) == Status.STALLED
+        live = np.asarray(grasp.active[i])
+        if int(proof.status[i]) != Status.PROVED_EXACTLY:
+            continue
+        exact = exact_map(grasp, i)
+        if not exact.full_rank:
+            out["no full rank in 70 digits"] += 1
+            continue
+        force, internal = (x[i].reshape(len(live), -1)[live] for x in (answer.force, held.internal_force))
+        truth = ExactForces(exact, wrench[i], criterion)
+        if int(answer.status[i]) == Status.INFEASIBLE:
+            out["settled in 70 digits"] += truth.below(answer.escape_twist[i]) > 10**6
+            out["contradictions"] += exact.lower(internal) > 0
+            continue
+        high, low = truth.above(force, internal), truth.below(answer.load_twist[i])
+        out["settled in 70 digits"] += (
+            float(high - low) <= TIGHT * abs(float(high)) if high < NOTHING else False
+        )
+        out["contradictions"] += bool(float(proof.lower[i]) > high or float(proof.upper[i]) < low)
+    return out
+
+
 def main() -> None:
     parser = parser_of_tables(__doc__)
     parser.add_argument("--count", type=int, default=100)
+    parser.add_argument("--forces", type=int, default=400)
     options = parser.parse_args()
     rows = {}
     for model in MODELS:
@@ -90,6 +134,11 @@ def main() -> None:
                 name: found[name] for name in COLUMNS
             }
             print(rows[f"{model.name}, {model.dimension}d, {width} contacts"], flush=True)
+    for name in ("soft", "hard", "planar hard"):
+        for criterion in ("gentlest", "smallest sum"):
+            found = measure_forces(name, criterion, options.forces)
+            rows[f"{criterion}, {name}"] = {column: found[column] for column in COLUMNS}
+            print(rows[f"{criterion}, {name}"], flush=True)
     total = {name: sum(row[name] for row in rows.values()) for name in COLUMNS}
     lines = [f"| grasps | {' | '.join(COLUMNS)} |", "|---" * (len(COLUMNS) + 1) + "|"]
     lines += [

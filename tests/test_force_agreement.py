@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from exact_forces import ExactForces
+from exact_margin import ExactMap
 from force_oracle import clarabel_forces, folded_map
 from force_problems import CRITERIA, problems
 
@@ -91,6 +93,29 @@ def test_clarabel_agrees(criterion, runs):
         assert (error < 1e-7).all(), np.sort(error)[-5:]
         # Loads at the very edge of what can be held, or of the limits: an honest answer, but one too many.
         assert (stalled & (answer != "unknown")).mean() < STALLED_SHARE
+
+
+def test_seventy_digits_enclose_the_pinch():
+    """The same in the plane: each finger presses W / (2 mu), between what forces reach and what a twist allows."""
+    position = np.array([[-1.0, 0], [1.0, 0]])
+    grasp = jg.Grasp(position, -position, jg.HardFinger(0.5))
+    load = np.array([0, -3.0, 0])
+    exact = ExactMap(position, -position, np.full(2, 0.5), np.zeros(2), ["f_x", "f_n"])
+    internal = np.asarray(jg.wrench_resistance(grasp).internal_force).reshape(2, 2)
+    for make, criterion, expected in ((jg.Gentlest, "gentlest", 3.0), (jg.SmallestSum, "smallest sum", 6.0)):
+        out, truth = (
+            jg.optimize_forces(grasp, load, criterion=make()),
+            ExactForces(exact, load, criterion),
+        )
+        high = truth.above(np.asarray(out.force).reshape(2, 2), internal)
+        low = truth.below(np.asarray(out.load_twist))
+        assert low <= expected <= high
+        assert float(high - low) < 1e-7
+        worse = np.asarray(out.load_twist) * 3
+        worse[2] = 4.0
+        assert truth.below(worse) < low
+    assert exact.lower(np.array([[0.0, 1.0], [0.0, 1.0]])) == 1
+    assert truth.above(np.array([[0.0, 1.0], [0.0, 1.0]]), np.zeros((2, 2))) == float("inf")
 
 
 # (model, limits, criterion): lanes of 2500 problems of a seed at which proofs were refused, or hold to rounding only.

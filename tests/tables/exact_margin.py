@@ -13,13 +13,14 @@ from decimal import Decimal
 
 import numpy as np
 
-__all__ = ["DIGITS", "ExactMap"]
+__all__ = ["DIGITS", "ExactMap", "exact", "norm"]
 
 DIGITS = 70
 NOTHING = Decimal("Infinity")
 
 
-def _exact(array) -> np.ndarray:
+def exact(array) -> np.ndarray:
+    """The numbers as they are, as decimals."""
     return np.array([Decimal(float(x)) for x in np.ravel(array)], object).reshape(np.shape(array))
 
 
@@ -27,7 +28,7 @@ def _root(x: Decimal) -> Decimal:
     return x.sqrt()
 
 
-def _norm(v) -> Decimal:
+def norm(v) -> Decimal:
     return _root(sum((x * x for x in v), Decimal(0)))
 
 
@@ -47,9 +48,9 @@ class ExactMap:
         self.components, self.dimension = components, np.shape(position)[1]
         with decimal.localcontext() as context:
             context.prec = DIGITS
-            p, n = _exact(position), _exact(normal)
-            self.mu, self.gamma = _exact(friction), _exact(torsion)
-            self.length = max((_norm(row) for row in p), default=Decimal(1)) or Decimal(1)
+            p, n = exact(position), exact(normal)
+            self.mu, self.gamma = exact(friction), exact(torsion)
+            self.length = max((norm(row) for row in p), default=Decimal(1)) or Decimal(1)
             self.blocks = [
                 self._block(*contact) for contact in zip(p / self.length, n, self.mu, self.gamma, strict=True)
             ]
@@ -58,7 +59,7 @@ class ExactMap:
 
     def _block(self, p, n, mu, gamma) -> np.ndarray:
         """(m, n), components in the order of the answer."""
-        n = [x / _norm(n) for x in n]
+        n = [x / norm(n) for x in n]
         zero = [Decimal(0)] * len(n)
         if len(n) == 2:
             tangents = {"f_x": [n[1], -n[0]]}
@@ -83,7 +84,7 @@ class ExactMap:
     def _inverse(gram: np.ndarray) -> np.ndarray | None:
         """None where the rank is not full, to 1e-20."""
         m = len(gram)
-        rows = np.concatenate([gram, _exact(np.eye(m))], 1)
+        rows = np.concatenate([gram, exact(np.eye(m))], 1)
         size = max(gram[i, i] for i in range(m))
         for i in range(m):
             pivot = max(range(i, m), key=lambda r: abs(rows[r, i]))
@@ -100,45 +101,58 @@ class ExactMap:
     def full_rank(self) -> bool:
         return self.inverse is not None
 
+    def scaled(self, force) -> np.ndarray | None:
+        """Forces (k, n) over mu and gamma; None where a component is asked for that does not exist."""
+        scales = {"f_n": np.full(len(self.mu), Decimal(1)), "tau_n": self.gamma}
+        s = exact(force)
+        for j, name in enumerate(self.components):
+            scale = scales.get(name, self.mu)
+            if any(x and not c for x, c in zip(s[:, j], scale, strict=True)):
+                return None
+            s[:, j] = [x / c if x else x for x, c in zip(s[:, j], scale, strict=True)]
+        return s
+
+    def balanced(self, s: np.ndarray, load: np.ndarray | int = 0) -> np.ndarray:
+        """The nearest s (k, n) with ``A s + load = 0``, where the rank is full."""
+        flat = s.ravel()
+        for _ in range(2):
+            flat = flat - self.A.T @ (self.inverse @ (self.A @ flat + load))
+        return flat.reshape(s.shape)
+
+    def depths(self, s: np.ndarray) -> list[Decimal]:
+        """s_0,i - |s_t,i| of each contact."""
+        head = self.components.index("f_n")
+        return [row[head] - norm(np.delete(row, head)) for row in s]
+
     def lower(self, force) -> Decimal:
         """t* is at least this, by forces (k, n) in the answer's components and order; -inf where they show nothing."""
         if not (np.isfinite(force).all() and self.full_rank):
             return -NOTHING
         with decimal.localcontext() as context:
             context.prec = DIGITS
-            scales = {"f_n": np.full(len(self.mu), Decimal(1)), "tau_n": self.gamma}
-            s = _exact(force)
-            for j, name in enumerate(self.components):
-                scale = scales.get(name, self.mu)
-                if any(x and not c for x, c in zip(s[:, j], scale, strict=True)):
-                    return -NOTHING
-                s[:, j] = [x / c if x else x for x, c in zip(s[:, j], scale, strict=True)]
-            largest = max(abs(x) for x in s.ravel())
-            if not largest:
+            s = self.scaled(force)
+            largest = Decimal(0) if s is None else max(abs(x) for x in s.ravel())
+            if s is None or not largest:
                 return -NOTHING
-            flat = s.ravel() / largest
-            for _ in range(2):
-                flat = flat - self.A.T @ (self.inverse @ (self.A @ flat))
-            s, head = flat.reshape(s.shape), self.components.index("f_n")
-            total = sum(s[:, head], Decimal(0))
+            s = self.balanced(s / largest)
+            total = sum(s[:, self.components.index("f_n")], Decimal(0))
             if total <= Decimal("1e-30"):
                 return -NOTHING
-            slack = min(row[head] - _norm(np.delete(row, head)) for row in s)
-            return len(s) * slack / total
+            return len(s) * min(self.depths(s)) / total
 
     def _velocities(self, twist) -> tuple[Decimal, Decimal, Decimal] | None:
         """d, T and |xi| of a twist (m,), lengths over the largest |p_i|; None where it is none."""
         if not np.isfinite(twist).all() or not np.any(twist):
             return None
-        xi = _exact(twist)
+        xi = exact(twist)
         xi[self.dimension :] = xi[self.dimension :] * self.length
         xi = xi / max(abs(x) for x in xi)
         head, depth, total = self.components.index("f_n"), NOTHING, Decimal(0)
         for block in self.blocks:
             x = block.T @ xi
-            depth = min(depth, x[head] - _norm(np.delete(x, head)))
+            depth = min(depth, x[head] - norm(np.delete(x, head)))
             total += x[head]
-        return depth, total, _norm(xi)
+        return depth, total, norm(xi)
 
     def upper(self, twist) -> Decimal:
         """t* is at most this, by a twist (m,); 1 where it shows nothing (it is never more)."""
