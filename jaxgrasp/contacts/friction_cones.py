@@ -5,7 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..core import Array, Float, safe_root
+from ..core import Array, Float, largest_of, safe_root
 from .grasp import Grasp
 from .validity import cleared
 
@@ -34,7 +34,7 @@ def cone_use(grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*b
     normal, psi = _split(scaled, index)
     use = jnp.where(psi == 0, 0.0, psi / jnp.where(normal > 0, normal, 1.0))
     use = jnp.where((normal < 0) | ((normal == 0) & (psi > 0)), jnp.inf, use)
-    return jnp.max(use, axis=-1)
+    return largest_of(use)
 
 
 @eqx.filter_jit

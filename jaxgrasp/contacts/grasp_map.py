@@ -6,7 +6,17 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ..conic import null_basis, singular_values
-from ..core import Array, Float, Int, contact_frame, cross, normalize, rank_tolerance, wrench_dimension
+from ..core import (
+    Array,
+    Float,
+    Int,
+    contact_frame,
+    cross,
+    largest_of,
+    normalize,
+    rank_tolerance,
+    wrench_dimension,
+)
 from .grasp import Grasp
 from .models import Component
 from .validity import cleared
@@ -82,7 +92,7 @@ def folded_grasp_map(grasp: Grasp) -> Float[Array, "*batch m kn"]:
 @eqx.filter_jit
 def length_scale(grasp: Grasp) -> Float[Array, "*batch"]:
     """``L = max_i |p_i|`` over the active contacts in m, or 1 where that is zero."""
-    largest = jnp.max(jnp.sum(cleared(grasp).position ** 2, axis=-1), axis=-1)
+    largest = largest_of(jnp.sum(cleared(grasp).position ** 2, axis=-1))
     there = largest > 0
     return jnp.where(there, jnp.sqrt(jnp.where(there, largest, 1.0)), 1.0)
 

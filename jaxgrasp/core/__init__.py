@@ -42,7 +42,7 @@ from .rotations import (
     rotation_between,
     turned,
 )
-from .select import bracket_width, first_of, nan_where, part_of
+from .select import bracket_width, first_of, largest_of, least_of, nan_where, part_of
 from .status import Status
 from .tolerances import (
     balance_tolerance,
@@ -97,8 +97,10 @@ __all__ = [
     "identity_orientation",
     "jacobian_product",
     "jacobian_solve",
+    "largest_of",
     "largest_response",
     "largest_sensitivity",
+    "least_of",
     "load_limit",
     "nan_where",
     "normalize",

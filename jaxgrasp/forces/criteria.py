@@ -17,7 +17,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ..contacts import Component, Grasp, cleared
-from ..core import Array, ArrayLike, Float, real_array
+from ..core import Array, ArrayLike, Float, largest_of, real_array
 
 __all__ = ["Criterion", "Gentlest", "LeastNorm", "Robust", "SmallestSum", "SumOfSquares"]
 
@@ -72,7 +72,7 @@ class Gentlest(Criterion):
     def cost(self, grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch"]:
         """``max_i f_n,i``, N."""
         normal = _normal_forces(grasp, force)
-        return jnp.max(jnp.where(grasp.active, normal, -jnp.inf), axis=-1)
+        return largest_of(jnp.where(grasp.active, normal, -jnp.inf))
 
 
 class Robust(Criterion):
@@ -101,7 +101,7 @@ class Robust(Criterion):
     def cost(self, grasp: Grasp, force: Float[Array, "*batch kn"]) -> Float[Array, "*batch"]:
         """``max_i f_n,i - weight * sum_i log det P_i``, N; infinite outside the cones."""
         normal = _normal_forces(grasp, force)
-        top = jnp.max(jnp.where(grasp.active, normal, -jnp.inf), axis=-1)
+        top = largest_of(jnp.where(grasp.active, normal, -jnp.inf))
         model = cleared(grasp).model
         on_normal, on_cone, constant = model.log_det_terms(grasp.dimension)
         psi = model.friction_function(_by_contact(grasp, force), grasp.dimension)

@@ -12,7 +12,20 @@ from jax.typing import ArrayLike
 
 from ..conic import pseudo_inverse
 from ..contacts import Grasp, TorqueLimits, cleared, folded_grasp_map, length_scale
-from ..core import Answer, Array, Bool, Float, Int, Status, first_of, rank_tolerance, real_array, safe_root
+from ..core import (
+    Answer,
+    Array,
+    Bool,
+    Float,
+    Int,
+    Status,
+    first_of,
+    largest_of,
+    least_of,
+    rank_tolerance,
+    real_array,
+    safe_root,
+)
 from ..resistance import wrench_resistance
 from .criteria import Criterion, Gentlest, Robust, SmallestSum
 from .demand import spread_loads
@@ -56,7 +69,7 @@ def _slack(grasp: Grasp, force: Array) -> Array:
     n, loads = grasp.model.force_size(grasp.dimension), force.ndim - 1 - len(grasp.batch_shape)
     wide = _with_load_axes(cleared(grasp), loads)
     slack = wide.model.feasibility_slack(force.reshape(*force.shape[:-1], -1, n), grasp.dimension)
-    return jnp.min(jnp.where(wide.active, slack, jnp.inf), axis=-1)
+    return least_of(jnp.where(wide.active, slack, jnp.inf))
 
 
 def _with_load_axes(grasp: Grasp, loads: int) -> Grasp:
@@ -180,7 +193,7 @@ def squeeze(grasp: Grasp, wrench: Float[ArrayLike, "*batch m"]) -> Squeeze:
     usable = jnp.all(strict, axis=-1) & balanced
     root = safe_root(middle * middle - leading * rest)
     safe = jnp.where(leading > 0, leading, 1.0)
-    effort = jnp.max(jnp.where(live, (root - middle) / safe, 0.0), axis=-1)
+    effort = largest_of(jnp.where(live, (root - middle) / safe, 0.0))
     effort = jnp.where(usable, jnp.maximum(effort, 0.0), jnp.inf)
 
     particular = (p * scale).reshape(*shape, k * n)

@@ -29,7 +29,18 @@ import numpy as np
 from ..backend import fori_loop
 from ..conic import pseudo_inverse, singular_values
 from ..contacts import Grasp, cleared, length_scale
-from ..core import Answer, Array, Float, Int, Status, nan_where, normalize, rank_tolerance, safe_root
+from ..core import (
+    Answer,
+    Array,
+    Float,
+    Int,
+    Status,
+    least_of,
+    nan_where,
+    normalize,
+    rank_tolerance,
+    safe_root,
+)
 from ..resistance import wrench_resistance
 from .unit_wrench_space import effort_map, scaled
 
@@ -152,7 +163,7 @@ def _resistant_slack(data: _Data, response: _Response, r: Array) -> Array:
     q = change / response.smallest
     second = jnp.sqrt(jnp.asarray(2.0, A.dtype)) * response.own * total * q / jnp.where(q < 1, 1 - q, 1.0)
     depth = s[:, 0] - _norm(s[:, 1:]) / (1 - r) - loss - second
-    depth = jnp.min(jnp.where(active, depth, jnp.inf))
+    depth = least_of(jnp.where(active, depth, jnp.inf))
     return jnp.where(q < 1, depth, -1.0)
 
 
@@ -172,7 +183,7 @@ def _escaping_slack(data: _Data, r: Array) -> Array:
         turning = data.torsion * (jnp.abs(data.normal @ omega) + c * rate)
         sliding = jnp.sqrt(sliding**2 + turning**2 + 1e-300)
     slack = normal - lost - sliding
-    return jnp.min(jnp.where(data.active, slack, jnp.inf))
+    return least_of(jnp.where(data.active, slack, jnp.inf))
 
 
 def _slack(data: _Data, response: _Response, resistant: Array, r: Array) -> Array:

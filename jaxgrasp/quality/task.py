@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from ..contacts import Grasp
-from ..core import Answer, Array, Float, Int, Status, nan_where
+from ..core import Answer, Array, Float, Int, Status, largest_of, nan_where
 from ..forces import Gentlest, OptimalForces, SmallestSum, resistible_wrenches
 from .unit_wrench_space import NORMS
 
@@ -64,7 +64,7 @@ def _worst_of(status: Array, forces: OptimalForces) -> TaskQuality:
     """The quality of a task from the forces of its wrenches."""
     cost = forces.cost
     effort = jnp.where(status == Status.OPTIMAL.value, cost, jnp.inf)
-    most = jnp.max(effort, axis=-1)
+    most = largest_of(effort)
     multiple = jnp.where(jnp.isfinite(most) & (most > 0), 1 / jnp.where(most > 0, most, 1.0), 0.0)
     multiple = jnp.where(most == 0, jnp.inf, multiple)
     invalid = jnp.any(status == Status.INVALID.value, axis=-1)

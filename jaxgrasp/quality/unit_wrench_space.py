@@ -18,7 +18,7 @@ from jax import lax
 from jax.typing import ArrayLike
 
 from ..contacts import Grasp, cleared, folded_grasp_map, length_scale, normal_first
-from ..core import Array, Bool, Float, real_array, safe_root, wrench_dimension
+from ..core import Array, Bool, Float, largest_of, real_array, safe_root, wrench_dimension
 
 __all__ = [
     "NORMS",
@@ -114,7 +114,7 @@ def signed_supports(
     v = jnp.einsum("...kmn,...dm->...dkn", A, direction)
     h = v[..., 0] + safe_root(jnp.sum(v[..., 1:] ** 2, axis=-1))
     h = jnp.where(active[..., None, :], h, -jnp.inf)
-    most = jnp.max(h, axis=-1)
+    most = largest_of(h)
     if norm == "L1":
         return most
     return jnp.where(most > 0, jnp.sum(jnp.maximum(h, 0.0), axis=-1), most)
