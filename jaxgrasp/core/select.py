@@ -11,7 +11,7 @@ import numpy as np
 
 from .arrays import Array, Index, on_host, placed
 
-__all__ = ["bracket_width", "first_of", "largest_of", "least_of", "nan_where", "part_of", "share_of_largest"]
+__all__ = ["bracket_width", "first_of", "largest_of", "least_of", "nan_where", "part_of"]
 
 Batch = TypeVar("Batch")  # a pytree of arrays with the batch axes in front
 
@@ -49,10 +49,10 @@ def bracket_width(lower: Array, upper: Array) -> Array:
 
 @jax.custom_jvp
 def largest_of(x: Array) -> Array:
-    """``max x`` along the last axis. Equal ones share its derivative.
+    """``max x`` along the last axis; its derivative is that of the first that is largest.
 
     A compiler may compute x twice, with other rounding: then nothing is equal to the maximum, and the derivative of
-    ``jnp.max`` is 0 / 0. Here it is that of one that is largest.
+    ``jnp.max`` is 0 / 0. An index is one whatever the rounding.
     """
     return jnp.max(x, axis=-1)
 
@@ -60,17 +60,9 @@ def largest_of(x: Array) -> Array:
 @largest_of.defjvp
 def _largest_of_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     (x,), (dx,) = primals, tangents
-    out = largest_of(x)
-    share = share_of_largest(x, out).astype(dx.dtype)
-    return out, jnp.sum(jnp.where(share > 0, share * dx, 0.0), axis=-1)
-
-
-def share_of_largest(x: Array, largest: Array) -> Array:
-    """What part each of x has of the derivative of ``largest``, as computed elsewhere: in all 1."""
-    same = x == largest[..., None]
-    one = jnp.arange(x.shape[-1], dtype=jnp.int32) == jax.lax.argmax(x, x.ndim - 1, jnp.int32)[..., None]
-    chosen = jnp.where(jnp.any(same, axis=-1, keepdims=True), same, one).astype(x.dtype)
-    return chosen / jnp.sum(chosen, axis=-1, keepdims=True)
+    first = jax.lax.argmax(x, x.ndim - 1, jnp.int32)[..., None]
+    chosen = jnp.arange(x.shape[-1], dtype=jnp.int32) == first
+    return largest_of(x), jnp.sum(jnp.where(chosen, dx, 0.0), axis=-1)
 
 
 def least_of(x: Array) -> Array:
