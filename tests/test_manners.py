@@ -175,6 +175,8 @@ def test_isotropy_and_volume_through_padding():
     two = quality.grasp_volume(jg.Grasp(p[:2], n[:2], jg.HardFinger(0.5)), torque_scale=1.0)
     np.testing.assert_allclose(volume, two, rtol=1e-12)
     assert np.isfinite(slope(lambda g: quality.grasp_volume(g, torque_scale=1.0)))
+    # So its second derivative is 0, though those of the singular values are not: their vectors turn.
+    assert abs(jax.grad(jax.grad(lambda s: quality.grasp_volume(grasp(s), torque_scale=1.0)))(1.0)) < 1e-12
     direct = np.asarray(jg.grasp_map(grasp(1.0)))[
         2
     ].sum()  # torques are what a scale of the positions changes

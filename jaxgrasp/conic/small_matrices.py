@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ..backend import batched, map_tiles, tile_width, to_lanes, to_rows
-from ..core import Array, Bool, Float
+from ..backend import batched, map_tiles, tile_width, to_lanes, to_rows, varying_like
+from ..core import Array, Bool, Float, unit_roundoff
 from .singular_values import row_svd
 
 __all__ = ["eigenvalues", "left_svd", "null_basis", "pseudo_inverse", "singular_values", "solve"]
@@ -64,16 +64,43 @@ def left_svd(A: Float[Array, "*batch m n"]) -> tuple[Float[Array, "*batch m"], F
 def _left_svd_jvp(primals, tangents):
     (A,), (dA,) = primals, tangents
     values, U = left_svd(A)
+    change, _ = _change(A, dA, values, U)
+    return (values, U), (change, jnp.zeros_like(U))
+
+
+def _change(A: Array, dA: Array, values: Array, U: Array) -> tuple[Array, Array]:
+    """``d sigma_i = u_i^T dA v_i`` (.., m), and v (.., m, n)."""
     projected = jnp.einsum("...mi,...mn->...in", U, A)
     square = jnp.sum(projected * projected, axis=-1)
     size = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), jnp.inf)
-    change = jnp.einsum("...mi,...mn,...in->...i", U, dA, projected / size[..., None])
-    return (values, U), (jnp.where(values > 0, change, 0.0), jnp.zeros_like(U))
+    V = projected / size[..., None]
+    return jnp.where(values > 0, jnp.einsum("...mi,...mn,...in->...i", U, dA, V), 0.0), V
+
+
+@jax.custom_jvp
+def _turning_svd(A: Array) -> tuple[Array, Array]:
+    """``left_svd`` with a derivative of U, which second derivatives of singular values need."""
+    return left_svd(A)
+
+
+@_turning_svd.defjvp
+def _turning_svd_jvp(primals, tangents):
+    """``dU = U W``, W_ij = (s_j P_ij + s_i P_ji) / (s_j^2 - s_i^2), P = U^T dA V; equal ones do not turn."""
+    (A,), (dA,) = primals, tangents
+    values, U = _turning_svd(A)
+    change, V = _change(A, dA, values, U)
+    P = jnp.einsum("...mi,...mn,...jn->...ij", U, dA, V)
+    square = values * values
+    apart = square[..., None, :] - square[..., None]
+    turns = jnp.abs(apart) > 64 * unit_roundoff(A.dtype) * jnp.max(square, axis=-1)[..., None, None]
+    mixed = P * values[..., None, :]
+    W = jnp.where(turns, (mixed + jnp.swapaxes(mixed, -1, -2)) / jnp.where(turns, apart, 1.0), 0.0)
+    return (values, U), (change, U @ W)
 
 
 def singular_values(A: Float[Array, "*batch m n"]) -> Float[Array, "*batch m"]:
-    """All m of them, largest first; zeros beyond n. To eps times the largest."""
-    return left_svd(A)[0]
+    """All m of them, largest first; zeros beyond n. To eps times the largest. Derivatives of every order."""
+    return _turning_svd(A)[0]
 
 
 def eigenvalues(M: Float[Array, "*batch m m"]) -> Float[Array, "*batch m"]:
@@ -172,6 +199,7 @@ def solve(M: Float[Array, "*batch s s"], b: Float[Array, "*batch s r"]) -> Float
     def eliminated(M: Array, b: Array) -> Array:
         return _in_tiles(_eliminated, (M, b), s * (s + r))
 
+    M, b = varying_like((M, b))((M, b))
     fixed = lax.stop_gradient(M)
     return lax.custom_linear_solve(
         lambda x: M @ x,
