@@ -67,6 +67,7 @@ def kill_and_compare(command, kills, folder, longest=3.0, seed=0):
         hit += killed(started(folder, *arguments), output, rng.uniform(0, longest))
         if output.exists():  # it was faster
             output.unlink()
+            longest *= 0.7
     finished(started(folder, *arguments))
     assert hit == kills
     assert output.read_bytes() == (folder / "whole.parquet").read_bytes()
