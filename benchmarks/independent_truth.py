@@ -1,6 +1,6 @@
 """Verdicts, brackets and costs against 70 decimal digits, on problems drawn towards the boundary between yes and no.
 
-    python benchmarks/independent_truth.py [--json FILE] [--markdown FILE] [--count 100]
+    python benchmarks/independent_truth.py [--json FILE] [--markdown FILE] [--count 100] [--forces 400]
 
 ``--count`` grasps for each contact model and 2, 4 and 8 contacts, with friction within 1e-3 to 1e-9 of the critical one
 (frictionless grasps as they come), and as many of the kinds of ``tests/tables/grasps.py``. The margin t* is enclosed by
@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import importlib
 from collections import Counter
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -27,10 +28,11 @@ from figures import parser_of_tables, write_table
 import jaxgrasp as jg
 from jaxgrasp import Status
 
-ExactMap: Any = importlib.import_module("exact_margin").ExactMap
+exact_map: Any = importlib.import_module("mutated_kinds").exact_map
 ExactForces: Any = importlib.import_module("exact_forces").ExactForces
 force_problems: Any = importlib.import_module("force_problems")
 WIDTHS = (2, 4, 8)
+TIGHT = 1e-6  # of the cost: a wider enclosure settles nothing
 NOTHING = float("inf")
 SAID = {Status.PROVED_EXACTLY.value: "proved exactly", Status.PROVED_TO_ROUNDING.value: "to rounding"}
 KINDS = ("near critical", "near critical", "box", "tilted")
@@ -38,9 +40,6 @@ COLUMNS = (
     "lanes", "proved exactly", "to rounding", "refused", "undecided by the solver", "no full rank in 70 digits",
     "settled in 70 digits", "contradictions",
 )  # fmt: skip
-
-
-TIGHT = 1e-6  # of the cost: a wider enclosure settles nothing
 
 
 def contradicts(grasp: Any, answer, force) -> tuple[bool, bool]:
@@ -56,12 +55,23 @@ def contradicts(grasp: Any, answer, force) -> tuple[bool, bool]:
     return settled, bool(wrong)
 
 
-def exact_map(grasp: jg.Grasp, i: int) -> Any:
-    """Grasp ``i`` in 70 digits."""
-    live, model = np.asarray(grasp.active[i]), grasp.model
-    arrays = (grasp.position, grasp.normal, model.friction_coefficient, model.torsion_coefficient)
-    names = [c.value for c in model.components(grasp.dimension)]
-    return ExactMap(*(np.asarray(x[i])[live] for x in arrays), names)
+def proved_lanes(
+    grasp: jg.Grasp, status, proof, open_: Status, out: Counter
+) -> Iterator[tuple[int, Any, Any]]:
+    """Lanes proved exactly whose rank is full: index, map in 70 digits, and a function that gives a force by contact.
+
+    The others are counted only; ``open_`` is the status of an answer that decides nothing.
+    """
+    for i in range(len(status)):
+        out[SAID.get(int(proof.status[i]), "refused")] += 1
+        out["undecided by the solver"] += int(status[i]) == open_
+        if int(proof.status[i]) != Status.PROVED_EXACTLY:
+            continue
+        exact, live = exact_map(grasp, i), np.asarray(grasp.active[i])
+        if exact.full_rank:
+            yield i, exact, lambda force, i=i, live=live: force[i].reshape(len(live), -1)[live]
+        else:
+            out["no full rank in 70 digits"] += 1
 
 
 def measure(model, width: int, kind: str, count: int, chunk: int) -> Counter:
@@ -70,18 +80,8 @@ def measure(model, width: int, kind: str, count: int, chunk: int) -> Counter:
     answer = jg.wrench_resistance(grasp)
     proof, out = jg.prove(grasp, answer), Counter(lanes=count)
     answer: Any = jax.tree.map(np.asarray, answer)
-    for i in range(count):
-        out[SAID.get(int(proof.status[i]), "refused")] += 1
-        out["undecided by the solver"] += int(answer.status[i]) == Status.UNDECIDED
-        live = np.asarray(grasp.active[i])
-        if int(proof.status[i]) != Status.PROVED_EXACTLY:
-            continue
-        exact = exact_map(grasp, i)
-        if not exact.full_rank:
-            out["no full rank in 70 digits"] += 1
-            continue
-        force = answer.internal_force[i].reshape(len(live), -1)[live]
-        settled, wrong = contradicts(exact, answer[i], force)
+    for i, exact, by_contact in proved_lanes(grasp, answer.status, proof, Status.UNDECIDED, out):
+        settled, wrong = contradicts(exact, answer[i], by_contact(answer.internal_force))
         out["settled in 70 digits"] += settled
         out["contradictions"] += wrong
     return out
@@ -95,26 +95,14 @@ def measure_forces(name: str, criterion: str, count: int) -> Counter:
     forces = jg.optimize_forces(grasp, **asked)
     proof, out = jg.prove(grasp, forces, **asked), Counter(lanes=count)
     answer, held = (jax.tree.map(np.asarray, x) for x in (forces, jg.wrench_resistance(grasp)))
-    for i in range(count):
-        out[SAID.get(int(proof.status[i]), "refused")] += 1
-        out["undecided by the solver"] += int(answer.status[i]) == Status.STALLED
-        live = np.asarray(grasp.active[i])
-        if int(proof.status[i]) != Status.PROVED_EXACTLY:
-            continue
-        exact = exact_map(grasp, i)
-        if not exact.full_rank:
-            out["no full rank in 70 digits"] += 1
-            continue
-        force, internal = (x[i].reshape(len(live), -1)[live] for x in (answer.force, held.internal_force))
-        truth = ExactForces(exact, wrench[i], criterion)
+    for i, exact, by_contact in proved_lanes(grasp, answer.status, proof, Status.STALLED, out):
+        truth, internal = ExactForces(exact, wrench[i], criterion), by_contact(held.internal_force)
         if int(answer.status[i]) == Status.INFEASIBLE:
             out["settled in 70 digits"] += truth.below(answer.escape_twist[i]) > 10**6
             out["contradictions"] += exact.lower(internal) > 0
             continue
-        high, low = truth.above(force, internal), truth.below(answer.load_twist[i])
-        out["settled in 70 digits"] += (
-            float(high - low) <= TIGHT * abs(float(high)) if high < NOTHING else False
-        )
+        high, low = truth.above(by_contact(answer.force), internal), truth.below(answer.load_twist[i])
+        out["settled in 70 digits"] += high < NOTHING and float(high - low) <= TIGHT * abs(float(high))
         out["contradictions"] += bool(float(proof.lower[i]) > high or float(proof.upper[i]) < low)
     return out
 

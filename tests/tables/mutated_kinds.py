@@ -20,7 +20,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 import jaxgrasp as jg
 
-__all__ = ["epsilon_kind", "force_kind", "kind_of", "random_grasps", "resistance_kind"]
+__all__ = ["epsilon_kind", "exact_map", "force_kind", "kind_of", "random_grasps", "resistance_kind"]
 
 RESISTANT, NOT_RESISTANT, MARGINAL, UNDECIDED, INVALID, OPTIMAL, INFEASIBLE = 1, 2, 3, 4, 5, 6, 7
 
@@ -33,18 +33,20 @@ def _numpy(answer: Any) -> Any:
     return out
 
 
-def _exact_maps(grasp: jg.Grasp) -> list[ExactMap]:
-    mu, gamma = coefficients_of(grasp)
-    p, n, live = (np.asarray(x) for x in (grasp.position, grasp.normal, grasp.active))
-    return [
-        ExactMap(p[i][live[i]], n[i][live[i]], mu[i][live[i]], gamma[i][live[i]], components_of(grasp))
-        for i in range(len(p))
-    ]
+def exact_map(grasp: jg.Grasp, i: int) -> ExactMap:
+    """Grasp ``i`` in 70 digits."""
+    live = np.asarray(grasp.active[i])
+    arrays = (grasp.position, grasp.normal, *coefficients_of(grasp))
+    return ExactMap(*(np.asarray(x[i])[live] for x in arrays), components_of(grasp))
 
 
 def resistance_kind(name: str, grasp: jg.Grasp) -> Kind:
     """Verdicts; t* is enclosed in 70 digits, evidence is evaluated in 70 digits."""
-    answer, maps, live = _numpy(jg.wrench_resistance(grasp)), _exact_maps(grasp), np.asarray(grasp.active)
+    answer, maps, live = (
+        _numpy(jg.wrench_resistance(grasp)),
+        [exact_map(grasp, i) for i in range(len(grasp.position))],
+        np.asarray(grasp.active),
+    )
     k = live.shape[-1]
 
     def of_lane(x: np.ndarray, i: int) -> np.ndarray:
